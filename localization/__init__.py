@@ -1,0 +1,1 @@
+"""Position from terrain: what the vehicle senses, matched against a prior map."""

@@ -1,0 +1,194 @@
+"""Map files: any elevation raster GDAL reads comes in, cloud-optimised GeoTIFF goes out."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.transform import Affine
+
+from perception.files import existing_file, whole_file
+from perception.records import Grid, InputError
+
+_SIGMA_NAMES = ("sigma", "uncertainty", "std", "stddev", "standard deviation")
+_ELEVATION_NAMES = ("elevation", "bathymetry", "height", "z", "topo", "depth")
+
+
+def read_map(path: Path, sigma_m: float | None = None) -> Grid:
+    """Read an elevation raster as a `Grid`, heights up.
+
+    Parameters
+    ----------
+    path : any raster GDAL opens (GeoTIFF, BAG, NetCDF, ASC, GMT grid).
+    sigma_m : 1-sigma for the whole map, used instead of a band of that meaning.
+
+    Returns
+    -------
+    Grid
+        Nodata and non-finite cells are NaN. A band described as depth is turned to elevation.
+
+    Raises
+    ------
+    InputError
+        Not a raster, no georeference, rotated, geographic (degrees), or without a single height.
+    """
+    path = existing_file(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(_main_subdataset(path)) as source:
+                return _grid_of(source, path, sigma_m)
+    except RasterioError as error:
+        raise InputError(
+            f"{path}: GDAL cannot read it as a raster ({error}); "
+            "give a GeoTIFF, BAG, NetCDF or ASC grid"
+        ) from error
+
+
+def _main_subdataset(path: Path) -> str:
+    """Return the dataset to open: a NetCDF of several variables hides them as subdatasets."""
+    with rasterio.open(path) as source:
+        if source.count or not source.subdatasets:
+            return str(path)
+        names = list(source.subdatasets)
+    for wanted in _ELEVATION_NAMES:
+        for name in names:
+            if name.rsplit(":", 1)[-1].strip("/").lower() == wanted:
+                return str(name)
+    return str(names[0])
+
+
+def _grid_of(source: Any, path: Path, sigma_m: float | None) -> Grid:
+    _refuse_unusable_frame(source, path)
+    descriptions = [(d or "").lower() for d in source.descriptions]
+    elevation_band = _band_named(descriptions, _ELEVATION_NAMES) or 1
+    elevation_m = _read_band(source, elevation_band)
+    if descriptions[elevation_band - 1].startswith("depth"):
+        elevation_m = -elevation_m
+    if not np.isfinite(elevation_m).any():
+        raise InputError(
+            f"{path}: band {elevation_band} holds no height at all (every cell is nodata or NaN)"
+        )
+    sigma_band = _band_named(descriptions, _SIGMA_NAMES)
+    sigma = None
+    if sigma_m is not None:
+        sigma = np.where(np.isfinite(elevation_m), float(sigma_m), np.nan)
+    elif sigma_band is not None:
+        sigma = _read_band(source, sigma_band)
+    count_band = _band_named(descriptions, ("count",))
+    transform = source.transform
+    return Grid(
+        elevation_m=elevation_m,
+        west_m=transform.c,
+        north_m=transform.f,
+        cell_m=transform.a,
+        cell_height_m=None if np.isclose(transform.a, -transform.e, rtol=1e-9) else -transform.e,
+        crs=source.crs.to_string() if source.crs else "",
+        sigma_m=sigma,
+        count=None if count_band is None else _read_band(source, count_band),
+        datum=source.tags().get("VERTICAL_DATUM", ""),
+    )
+
+
+def _refuse_unusable_frame(source: Any, path: Path) -> None:
+    transform = source.transform
+    if transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
+        if transform == Affine.identity():
+            raise InputError(
+                f"{path}: has no georeference; give a raster with a projected CRS in metres"
+            )
+        raise InputError(
+            f"{path}: its rows do not run north to south (transform {tuple(transform)[:6]}); "
+            "warp it to a north-up grid: gdalwarp -t_srs EPSG:<UTM zone> in.tif out.tif"
+        )
+    if source.crs is not None and source.crs.is_geographic:
+        raise InputError(
+            f"{path}: its cells are in degrees ({source.crs.to_string()}); "
+            "warp it to metres: gdalwarp -t_srs EPSG:<UTM zone> in.tif out.tif"
+        )
+    if source.crs is not None and source.crs.linear_units_factor[1] != 1.0:
+        raise InputError(
+            f"{path}: its cells are in {source.crs.linear_units_factor[0]}; "
+            "warp it to metres: gdalwarp -t_srs EPSG:<UTM zone> in.tif out.tif"
+        )
+
+
+def _band_named(descriptions: Sequence[str], names: Sequence[str]) -> int | None:
+    for name in names:
+        for band, description in enumerate(descriptions, start=1):
+            if description.split(" ")[0] == name:
+                return band
+    return None
+
+
+def _read_band(source: Any, band: int) -> npt.NDArray[np.float64]:
+    values = source.read(band, masked=True).astype(np.float64)
+    scale, offset = source.scales[band - 1], source.offsets[band - 1]
+    filled: npt.NDArray[np.float64] = values.filled(np.nan) * scale + offset
+    filled[~np.isfinite(filled)] = np.nan
+    return filled
+
+
+def write_map(path: Path, grid: Grid, tags: Mapping[str, str] | None = None) -> None:
+    """Write `map.tif` as the contract has it: float32 bands elevation, sigma, count; NaN nodata.
+
+    A grid without sigma or count gets bands of NaN, so that the bands' order never varies.
+    """
+    nothing = np.full(grid.shape, np.nan)
+    bands = {
+        "elevation": grid.elevation_m,
+        "sigma": nothing if grid.sigma_m is None else grid.sigma_m,
+        "count": nothing if grid.count is None else grid.count,
+    }
+    extra = {"VERTICAL_DATUM": grid.datum} if grid.datum else {}
+    write_bands(path, bands, grid, tags={**extra, **(tags or {})})
+
+
+def write_bands(
+    path: Path,
+    bands: Mapping[str, npt.NDArray[Any]],
+    frame: Grid,
+    dtype: str = "float32",
+    nodata: float | None = float("nan"),
+    tags: Mapping[str, str] | None = None,
+) -> None:
+    """Write described bands on the frame (origin, cell, CRS) of a grid as a COG.
+
+    Parameters
+    ----------
+    bands : description to (rows, cols) array, in the order of the file.
+    frame : the grid whose georeference is taken.
+    """
+    rows, cols = frame.shape
+    transform = Affine(frame.cell_m, 0, frame.west_m, 0, -frame.cell_north_m, frame.north_m)
+    profile = {
+        "driver": "COG",
+        "dtype": dtype,
+        "count": len(bands),
+        "height": rows,
+        "width": cols,
+        "crs": frame.crs or None,
+        "transform": transform,
+        "nodata": nodata,
+        "compress": "deflate",
+        "predictor": "yes",
+        # Averaged overviews of labels would invent classes.
+        "overview_resampling": "nearest"
+        if np.issubdtype(np.dtype(dtype), np.integer)
+        else "average",
+    }
+    with whole_file(path) as temporary:
+        try:
+            with rasterio.open(temporary, "w", **profile) as target:
+                for index, (name, values) in enumerate(bands.items(), start=1):
+                    target.write(np.asarray(values).astype(dtype), index)
+                    target.set_band_description(index, name)
+                target.update_tags(**dict(tags or {}))
+        except RasterioError as error:
+            raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from error

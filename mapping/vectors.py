@@ -1,0 +1,88 @@
+"""Vector layers: GeoPackage in the map's CRS, GeoJSON in longitude and latitude."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyogrio.raw
+import shapely
+from pyproj import CRS, Transformer
+
+from perception.files import existing_file, whole_file
+from perception.records import InputError
+
+
+def write_layer(
+    path: Path,
+    geometries: Sequence[Any] | npt.NDArray[Any],
+    columns: Mapping[str, npt.NDArray[Any]],
+    crs: str,
+    geometry_type: str,
+    layer: str | None = None,
+) -> None:
+    """Write one layer, whole or not at all; the suffix chooses GPKG or GeoJSON.
+
+    Parameters
+    ----------
+    geometries : (n,) shapely geometries in `crs`.
+    columns : attribute to (n,) array.
+    geometry_type : "Point", "LineString", "Polygon", "MultiPolygon", with " Z" or "3D " as OGR has it.
+    """
+    shapes = np.asarray(geometries, dtype=object)
+    target_crs = crs
+    if path.suffix == ".geojson" and crs:
+        # RFC 7946 knows WGS 84 only.
+        shapes, target_crs = to_lonlat(shapes, crs), "EPSG:4326"
+    driver = {".gpkg": "GPKG", ".geojson": "GeoJSON"}[path.suffix]
+    with whole_file(path) as temporary:
+        try:
+            pyogrio.raw.write(
+                temporary,
+                shapely.to_wkb(shapes),
+                field_data=[np.asarray(v) for v in columns.values()],
+                fields=list(columns),
+                crs=target_crs or None,
+                geometry_type=geometry_type,
+                driver=driver,
+                layer=layer or path.stem,
+            )
+        except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+            raise InputError(f"{path}: cannot be written ({error})") from error
+
+
+def to_lonlat(shapes: npt.NDArray[Any], crs: str) -> npt.NDArray[Any]:
+    """Return shapely geometries of `crs` in WGS 84 longitude and latitude."""
+    transformer = Transformer.from_crs(CRS.from_user_input(crs), 4326, always_xy=True)
+
+    def reproject(coordinates: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        lon_deg, lat_deg = transformer.transform(coordinates[:, 0], coordinates[:, 1])
+        return np.column_stack([lon_deg, lat_deg, *coordinates[:, 2:].T])
+
+    has_z = bool(shapely.has_z(shapes).any())
+    moved: npt.NDArray[Any] = shapely.transform(shapes, reproject, include_z=has_z)
+    return moved
+
+
+def read_polygons(path: Path, crs: str) -> list[Any]:
+    """Read every polygon of a vector file, reprojected to `crs`."""
+    path = existing_file(path)
+    try:
+        meta, _, geometry, _ = pyogrio.raw.read(path, columns=[])
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        raise InputError(
+            f"{path}: cannot be read as polygons ({error}); give a GeoPackage or GeoJSON"
+        ) from error
+    shapes = shapely.from_wkb(geometry)
+    if crs and meta["crs"] and CRS.from_user_input(meta["crs"]) != CRS.from_user_input(crs):
+        transformer = Transformer.from_crs(meta["crs"], crs, always_xy=True)
+        shapes = shapely.transform(
+            shapes, lambda c: np.column_stack(transformer.transform(c[:, 0], c[:, 1]))
+        )
+    polygons = [p for p in shapely.get_parts(shapes) if p.geom_type == "Polygon"]
+    if not polygons:
+        raise InputError(f"{path}: holds no polygon; draw the areas as polygons")
+    return polygons

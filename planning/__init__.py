@@ -1,0 +1,1 @@
+"""Routes near the bottom, within the vehicle's limits, proved clear."""

@@ -1,0 +1,1 @@
+"""Simulate, run, repeat, compare and report; the command line. Nothing imports this package."""

@@ -1,0 +1,34 @@
+"""The benchmark suite: speed and accuracy, each beside a peer or a simpler method in the same run.
+
+A benchmark is a module here with a function ``run(progress) -> Table`` and one line in `BENCHMARKS`;
+it is imported only when it is asked for. A peer that is not installed is a row that says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+# name -> (module below scenarios.benchmarks, what it measures)
+BENCHMARKS: dict[str, tuple[str, str]] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One measured figure: what was measured, by which method, the value and its unit."""
+
+    case: str
+    method: str
+    figure: str
+    value: float | None
+    unit: str
+    goal: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """The result of a benchmark; `settings` tells what another run would need to repeat it."""
+
+    name: str
+    rows: tuple[Row, ...]
+    settings: dict[str, object] = field(default_factory=dict)

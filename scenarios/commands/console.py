@@ -1,0 +1,89 @@
+"""What every command shares: verbosity, progress bars, output folders."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from perception.records import InputError, Progress, silent
+
+
+def common_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add -q and -v to a command; they arrive as `quiet` and `verbose`."""
+    command = click.option("-q", "--quiet", is_flag=True, help="Print nothing but errors.")(command)
+    return click.option("-v", "--verbose", is_flag=True, help="Tell what is done, step by step.")(
+        command
+    )
+
+
+def out_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the required --out DIR; it arrives as `out`."""
+    return click.option(
+        "--out", required=True, type=click.Path(path_type=Path), help="Folder for the results."
+    )(command)
+
+
+def set_verbosity(quiet: bool, verbose: bool) -> None:
+    """Choose the level of the libraries' log."""
+    level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
+    logging.getLogger().setLevel(level)
+    # Third parties tell their own stories at INFO; ours are the ones asked for.
+    for name in ("rasterio", "fiona", "pyogrio", "numba", "matplotlib", "distributed"):
+        logging.getLogger(name).setLevel(max(level, logging.WARNING))
+
+
+def prepare_out(out: Path) -> Path:
+    """Make the output folder and prove that it can be written, before any work is done."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".bathynav-probe"
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be used as output folder ({error.strerror}); "
+            "give --out a folder that can be written"
+        ) from error
+    return out
+
+
+@contextmanager
+def progress_bars(quiet: bool = False) -> Iterator[Progress]:
+    """Yield a `Progress` that draws one bar per label on a terminal, and nothing in a pipe."""
+    if quiet or not sys.stderr.isatty():
+        yield silent
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    columns = (
+        TextColumn("{task.description:<28}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Bars(*columns, console=Console(stderr=True)) as bars:
+        tasks: dict[str, Any] = {}
+
+        def report(label: str, done: int, total: int) -> None:
+            if label not in tasks:
+                tasks[label] = bars.add_task(label, total=total)
+            bars.update(tasks[label], completed=done, total=total)
+
+        yield report
+
+
+def print_table(title: str, rows: list[tuple[str, str]]) -> None:
+    """Print name and value pairs, aligned, without colour or wrapping."""
+    click.echo(title)
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, value in rows:
+        click.echo(f"  {name:<{width}}  {value}")
