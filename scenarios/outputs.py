@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import json
 import math
@@ -18,6 +19,7 @@ from perception.records import InputError
 _VERSIONS = ("bathynav", "numpy", "scipy", "gtsam", "ompl", "numba", "rasterio")
 
 
+@functools.cache
 def versions() -> dict[str, str]:
     """Return the versions that decide a result."""
     found = {}
