@@ -39,9 +39,9 @@ def check_config(task: str, config: dict[str, Any], path: Path) -> None:
     """Refuse a run's config before anything runs; tasks without a schema take what they get."""
     if task == "arithmetic":
         return
-    from scenarios.schema import parse_scenario
+    from scenarios.schema import scenario_of
 
-    parse_scenario(config, path)
+    scenario_of(config, str(path))
 
 
 def arithmetic_task(config: dict[str, Any], folder: Path) -> dict[str, Any]:
