@@ -1,0 +1,254 @@
+"""Polish: move the control polygon until no shift of it, wide or narrow, lowers the exact cost.
+
+Pattern search over bumps of several widths. Each trial re-samples the window of the curve that it
+changes and gives it its best depth profile, so what falls is the very cost that is reported, pitch
+limits, ceiling and turning radius included.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from perception.records import FloatArray
+from planning.curve import sample_curve
+from planning.profile import make_work, path_cost
+from planning.surface import Surface
+
+# Price per metre by which the tangents of an arc do not fit: above what any shortcut can save.
+_OVERLAP_PRICE = 300.0
+# Pitch and radius are planned a little inside the limits: printed digits must keep them too.
+PITCH_RESERVE = 0.995
+RADIUS_RESERVE = 1.01
+# Height kept in reserve while planning, at floor and ceiling (m): the samples lie a cell apart, the
+# exact clearance between them is made good afterwards by lifting.
+HEIGHT_RESERVE_M = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A control polygon in local coordinates and what its rounded curve costs.
+
+    Attributes
+    ----------
+    points : (n, 2) control polygon.
+    cost : of the curve with its best profile, prices of breaches included.
+    breach : integral of what it breaks; 0 keeps every limit.
+    source : who proposed it.
+    """
+
+    points: FloatArray
+    cost: float
+    breach: float
+    source: str = ""
+
+
+def rules_of(surface: Surface) -> FloatArray:
+    """Return the rules of `path_cost` for a surface's limits and terms."""
+    limits = surface.limits
+    return np.array(
+        [
+            surface.terms.altitude_per_m,
+            limits.slope_up * PITCH_RESERVE,
+            limits.slope_down * PITCH_RESERVE,
+            limits.floor_m,
+            limits.ceiling_m,
+            surface.bottom_most_m,
+            surface.top_m,
+            HEIGHT_RESERVE_M,
+        ]
+    )
+
+
+def control_spacing(surface: Surface, length_m: float) -> float:
+    """Return the distance of control points: about the radius, some cells, at most 400 of them."""
+    cell = max(surface.cell_m)
+    return max(surface.limits.turn_radius_m, 6.0 * cell, length_m / 400.0)
+
+
+def respace(points: FloatArray, spacing: float) -> FloatArray:
+    """Return a polygon of equal legs about `spacing` along the given one, ends kept."""
+    legs = np.hypot(*np.diff(points, axis=0).T)
+    s = np.concatenate([[0.0], np.cumsum(legs)])
+    n = max(2, round(s[-1] / spacing))
+    at = np.linspace(0.0, s[-1], n + 1)
+    return np.column_stack([np.interp(at, s, points[:, 0]), np.interp(at, s, points[:, 1])])
+
+
+def smooth_guide(points: FloatArray, spacing: float) -> FloatArray:
+    """Return a guide's control polygon: the grid's zigzag averaged over one spacing, ends kept."""
+    fine = respace(points, spacing / 8.0)
+    half = min(4, (len(fine) - 1) // 2)
+    if half > 0:
+        padded = np.concatenate(
+            [2 * fine[:1] - fine[half:0:-1], fine, 2 * fine[-1:] - fine[-2 : -half - 2 : -1]]
+        )
+        kernel = np.ones(2 * half + 1) / (2 * half + 1)
+        fine = np.column_stack([np.convolve(padded[:, i], kernel, "valid") for i in (0, 1)])
+    return respace(fine, spacing)
+
+
+def evaluate(surface: Surface, points: FloatArray, source: str = "") -> Candidate:
+    """Cost a control polygon as it stands."""
+    cost, breach = _whole_cost(
+        surface.stack, surface.cell_m[0], surface.cell_m[1], points,
+        surface.limits.turn_radius_m * RADIUS_RESERVE, min(surface.cell_m), rules_of(surface),
+        *_scratch(surface, points),
+    )  # fmt: skip
+    return Candidate(points, float(cost), float(breach), source)
+
+
+def polish(
+    surface: Surface, points: FloatArray, sweeps: int = 60, rounds: int = 3, source: str = ""
+) -> Candidate:
+    """Lower the cost of a control polygon until it stops falling; ends stay.
+
+    Parameters
+    ----------
+    points : (n, 2) control polygon in local coordinates.
+    sweeps : most passes over all bumps in a round.
+    rounds : after each but the last the control points are spaced evenly again.
+    """
+    spacing = control_spacing(surface, float(np.hypot(*np.diff(points, axis=0).T).sum()))
+    best = evaluate(surface, points, source)
+    points = points.copy()
+    for turn in range(rounds):
+        if turn > 0:
+            points = respace(points, spacing)
+        _descend(
+            surface.stack, surface.cell_m[0], surface.cell_m[1], points,
+            surface.limits.turn_radius_m * RADIUS_RESERVE, min(surface.cell_m), rules_of(surface),
+            *_scratch(surface, points), sweeps, _margin_m(surface),
+        )  # fmt: skip
+        found = evaluate(surface, points.copy(), source)
+        if found.cost < best.cost or (best.breach > 0 and found.breach == 0):
+            best = found
+    return best
+
+
+def _margin_m(surface: Surface) -> float:
+    """Return how far along the path a change of height can make itself felt."""
+    band = surface.limits.ceiling_m - surface.limits.floor_m
+    slope = min(surface.limits.slope_up, surface.limits.slope_down)
+    return min(band / slope, 12.0 * band) + 4.0 * max(surface.cell_m)
+
+
+def _scratch(surface: Surface, points: FloatArray) -> tuple[FloatArray, ...]:
+    length = float(np.hypot(*np.diff(points, axis=0).T).sum())
+    # A path may grow while it is moved; twice its samples leaves room, and what does not fit is refused.
+    n = int(2.0 * length / min(surface.cell_m)) + 4 * len(points) + 256
+    work, hull = make_work(n)
+    return np.empty(n), np.empty(n), work, hull
+
+
+@njit(cache=True)
+def _whole_cost(stack, width, height, points, radius, step, rules, px, py, work, hull):  # type: ignore[no-untyped-def]
+    n, overlap = sample_curve(points, 0, len(points) - 1, radius, step, px, py)
+    if n < 0:
+        return np.inf, np.inf
+    cost, breach = path_cost(stack, width, height, px, py, n, rules, work, hull)
+    return cost + _OVERLAP_PRICE * overlap, breach + overlap
+
+
+@njit(cache=True)
+def _window_cost(
+    stack, width, height, points, first, last, radius, step, rules, px, py, work, hull
+):  # type: ignore[no-untyped-def]
+    n, overlap = sample_curve(points, first, last, radius, step, px, py)
+    if n < 0:
+        return np.inf
+    cost, _ = path_cost(stack, width, height, px, py, n, rules, work, hull)
+    return cost + _OVERLAP_PRICE * overlap
+
+
+@njit(cache=True)
+def _descend(stack, width, height, points, radius, step, rules, px, py, work, hull, sweeps, margin):  # type: ignore[no-untyped-def]
+    n = len(points)
+    if n < 3:
+        return
+    spacing = math.hypot(points[1, 0] - points[0, 0], points[1, 1] - points[0, 1])
+    spacing = max(spacing, step)
+    beyond = math.ceil(margin / spacing) + 2
+    widths = np.array([16, 8, 4, 2, 1])
+    finest = 0.02 * step
+    delta = np.empty((len(widths), n))
+    for level in range(len(widths)):
+        delta[level, :] = min(0.25 * spacing * widths[level], 8.0 * spacing)
+    saved = np.empty((n, 2))
+    for sweep in range(sweeps):
+        gained, total = 0.0, 0.0
+        for level in range(len(widths)):
+            half = widths[level]
+            if half > 1 and half > n // 2:
+                continue
+            stride = max(1, half // 2)
+            for centre in range(1 + sweep % stride, n - 1, stride):
+                d = delta[level, centre]
+                if d < finest:
+                    # Rested; look again now and then, since its neighbours move.
+                    if sweep % 4 != 3:
+                        continue
+                    d = 4.0 * finest
+                j0, j1 = max(1, centre - half + 1), min(n - 2, centre + half - 1)
+                first, last = max(0, j0 - 1 - beyond), min(n - 1, j1 + 1 + beyond)
+                old = _window_cost(
+                    stack,
+                    width,
+                    height,
+                    points,
+                    first,
+                    last,
+                    radius,
+                    step,
+                    rules,
+                    px,
+                    py,
+                    work,
+                    hull,
+                )
+                tx = points[centre + 1, 0] - points[centre - 1, 0]
+                ty = points[centre + 1, 1] - points[centre - 1, 1]
+                norm = max(math.hypot(tx, ty), 1e-9)
+                nx, ny = -ty / norm, tx / norm
+                for j in range(j0, j1 + 1):
+                    saved[j, 0], saved[j, 1] = points[j, 0], points[j, 1]
+                better = False
+                for sign in (1.0, -1.0):
+                    for j in range(j0, j1 + 1):
+                        share = sign * d * (1.0 - abs(j - centre) / half)
+                        points[j, 0] = saved[j, 0] + share * nx
+                        points[j, 1] = saved[j, 1] + share * ny
+                    new = _window_cost(
+                        stack,
+                        width,
+                        height,
+                        points,
+                        first,
+                        last,
+                        radius,
+                        step,
+                        rules,
+                        px,
+                        py,
+                        work,
+                        hull,
+                    )
+                    if new < old - 1e-7:
+                        better = True
+                        gained += old - new
+                        break
+                if better:
+                    delta[level, centre] = min(2.0 * d, 8.0 * spacing)
+                else:
+                    for j in range(j0, j1 + 1):
+                        points[j, 0], points[j, 1] = saved[j, 0], saved[j, 1]
+                    delta[level, centre] = 0.4 * d
+        if sweep % 4 == 3:
+            n_s, _ = sample_curve(points, 0, n - 1, radius, step, px, py)
+            if n_s > 0:
+                total, _ = path_cost(stack, width, height, px, py, n_s, rules, work, hull)
+            if gained < 2e-6 * total:
+                break

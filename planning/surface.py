@@ -1,0 +1,141 @@
+"""The map as the planners see it: the least height everywhere, the ground's weight, what is barred.
+
+Local coordinates: x metres east and y metres *south* of the centre of the raster's first cell, so
+that column = x / width and row = y / height.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from perception.records import BoolArray, FloatArray, Grid
+from planning.cost import CostTerms
+from planning.limits import VehicleLimits
+
+# Layers of `Surface.stack`.
+LOWER, BOTTOM, WEIGHT, BAR = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Rasters for planning; NaN-free, so that a search may look anywhere.
+
+    Attributes
+    ----------
+    bottom_m : (rows, cols) sea floor as stored, NaN no data.
+    lower_m : (rows, cols) least height of the vehicle: bottom + floor + k sigma; NaN no data.
+    barred : (rows, cols) True where no route may pass: no data, no-go area, or no water left between
+        floor and surface.
+    stack : (rows, cols, 4) float32 layers lower, bottom, weight, bar: filled from the nearest cell
+        where there is no data; bar is the distance (m) into barred ground, 0 outside it.
+    origin_m : easting and northing of the first cell's centre.
+    cell_m : width and height of a cell.
+    top_m : height of the water's surface above the datum; infinite on dry stand-ins.
+    """
+
+    bottom_m: FloatArray
+    lower_m: FloatArray
+    barred: BoolArray
+    stack: FloatArray
+    origin_m: tuple[float, float]
+    cell_m: tuple[float, float]
+    top_m: float
+    limits: VehicleLimits
+    terms: CostTerms
+    k: float = 0.0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        rows, cols = self.bottom_m.shape
+        return rows, cols
+
+    @property
+    def bottom_most_m(self) -> float:
+        """Least height that the depth limit allows."""
+        return -self.limits.depth_max_m
+
+    def local(self, easting_m: FloatArray, northing_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return local x, y of map coordinates."""
+        return (
+            np.asarray(easting_m, float) - self.origin_m[0],
+            self.origin_m[1] - np.asarray(northing_m, float),
+        )
+
+    def world(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return easting and northing of local coordinates."""
+        return self.origin_m[0] + np.asarray(x_m), self.origin_m[1] - np.asarray(y_m)
+
+
+def build_surface(
+    grid: Grid,
+    limits: VehicleLimits,
+    terms: CostTerms,
+    weight: FloatArray | None = None,
+    sigma_m: FloatArray | None = None,
+    k: float = 0.0,
+    forbidden: BoolArray | None = None,
+    submerged: bool = True,
+) -> Surface:
+    """Make the planners' rasters from a map.
+
+    Parameters
+    ----------
+    weight : (rows, cols) `w`; 1 everywhere without.
+    sigma_m : (rows, cols) what the clearance must cover `k` times; NaN bars a cell when k > 0.
+    forbidden : (rows, cols) True in no-go areas.
+    submerged : whether height 0 is the water's surface, which no route may leave.
+    """
+    bottom = np.asarray(grid.elevation_m, float)
+    lower = bottom + limits.floor_m
+    if sigma_m is not None and k > 0:
+        lower = lower + k * sigma_m
+    top = 0.0 if submerged else np.inf
+    with np.errstate(invalid="ignore"):
+        barred = ~np.isfinite(lower) | (lower > top)
+        barred |= bottom + limits.ceiling_m < np.maximum(lower, -limits.depth_max_m)
+    if forbidden is not None:
+        barred |= forbidden
+    w = np.ones(bottom.shape) if weight is None else np.asarray(weight, float)
+    w = np.where(np.isfinite(w), w, 1.0)
+    if terms.uncertainty_per_m > 0 and sigma_m is not None:
+        w = w + terms.uncertainty_per_m * np.nan_to_num(sigma_m)
+    return Surface(
+        bottom_m=bottom,
+        lower_m=lower,
+        barred=barred,
+        stack=_stack(bottom, lower, w, barred, (grid.cell_m, grid.cell_north_m)),
+        origin_m=(grid.west_m + 0.5 * grid.cell_m, grid.north_m - 0.5 * grid.cell_north_m),
+        cell_m=(grid.cell_m, grid.cell_north_m),
+        top_m=top,
+        limits=limits,
+        terms=terms,
+        k=k,
+    )
+
+
+def _stack(
+    bottom: FloatArray,
+    lower: FloatArray,
+    weight: FloatArray,
+    barred: BoolArray,
+    cell_m: tuple[float, float],
+) -> FloatArray:
+    stack = np.empty((*bottom.shape, 4), np.float32)
+    stack[..., LOWER], stack[..., BOTTOM], stack[..., WEIGHT] = lower, bottom, weight
+    stack[..., BAR] = 0.0
+    if not barred.any():
+        return stack
+    missing = ~(np.isfinite(lower) & np.isfinite(bottom))
+    if missing.all():
+        stack[..., :2] = 0.0
+    elif missing.any():
+        rows, cols = ndimage.distance_transform_edt(
+            missing, return_distances=False, return_indices=True
+        )
+        stack[..., LOWER] = lower[rows, cols]
+        stack[..., BOTTOM] = bottom[rows, cols]
+    stack[..., BAR] = ndimage.distance_transform_edt(barred, sampling=(cell_m[1], cell_m[0]))
+    return stack
