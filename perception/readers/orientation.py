@@ -77,6 +77,23 @@ def _greatest_step(level: FloatArray) -> float:
     return float(best)
 
 
+def first_return_fraction(row: FloatArray) -> float:
+    """Return where a row (near to far) steps from quiet to loud, as a share of its length.
+
+    A crude first return, for telling whether an altitude field can be true; NaN where no step shows.
+    """
+    level = _block_levels(np.asarray(row, float))
+    if level is None:
+        return float("nan")
+    best, where = _SURE, float("nan")
+    for at in range(_SKIP + 2, _DEEPEST):
+        before = np.sort(level[_SKIP:at])[(at - _SKIP) * 3 // 4]
+        step = level[at : at + 2].mean() - before
+        if step > best:
+            best, where = step, at / _BLOCKS
+    return where
+
+
 def _step_at(level: FloatArray, at: int) -> float:
     before = level[max(at - 2 * _AFTER, _SKIP) : max(at - 1, _SKIP + 1)]
     return float(level[at : at + 2 * _AFTER].mean() - before.mean())

@@ -108,6 +108,7 @@ class Survey:
         """Bring scanned files into one frame, mend what can be mended, split into passes."""
         defects: list[str] = []
         warnings: list[str] = []
+        _refuse_without_pings(files)
         target = _target_crs(files, crs, warnings)
         tables = []
         for number, raw in enumerate(files):
@@ -231,7 +232,27 @@ def _target_crs(files: Sequence[RawFile], crs: str | None, warnings: list[str]) 
             "give --crs EPSG:N where the zone is known"
         )
         return LOCAL_CRS
-    return LOCAL_CRS
+    raise InputError(
+        f"{_names(files)}: none of {plural(sum(len(raw.pings) for raw in files), 'ping')} has a valid "
+        "position (all zero or NaN); give a file with navigation"
+    )
+
+
+def _names(files: Sequence[RawFile]) -> str:
+    return ", ".join(str(raw.path) for raw in files)
+
+
+def _refuse_without_pings(files: Sequence[RawFile]) -> None:
+    """Refuse files that are sound but hold no side-scan, and say what they do hold."""
+    if any(len(raw.pings) for raw in files):
+        return
+    held = "; ".join(
+        ", ".join(f"{n:,} {kind}" for kind, n in (raw.packets or {}).items()) or "nothing"
+        for raw in files
+    )
+    raise InputError(
+        f"{_names(files)}: holds no side-scan ({held}); give a file with side-scan channels"
+    )
 
 
 def _table_of(raw: RawFile, number: int, target: str, defects: list[str]) -> PingTable:
@@ -316,17 +337,16 @@ def _joined(tables: Sequence[PingTable]) -> PingTable:
 
 
 def _refuse_unusable(files: Sequence[RawFile], table: PingTable) -> None:
-    names = ", ".join(str(raw.path) for raw in files)
     usable = int(table.usable.sum())
     if usable >= FEWEST_PINGS:
         return
     if len(table) >= FEWEST_PINGS and not np.isfinite(table.easting_m).any():
         raise InputError(
-            f"{names}: none of {plural(len(table), 'ping')} has a valid position (all zero or NaN); "
-            "give a file with navigation"
+            f"{_names(files)}: none of {plural(len(table), 'ping')} has a valid position in this CRS; "
+            "give another --crs"
         )
     raise InputError(
-        f"{names}: {usable} usable of {plural(len(table), 'side-scan ping')}, at least "
+        f"{_names(files)}: {usable} usable of {plural(len(table), 'side-scan ping')}, at least "
         f"{FEWEST_PINGS} are needed; give a longer recording"
     )
 

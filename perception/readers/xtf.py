@@ -156,9 +156,10 @@ def _chosen_channels(
     numbers = np.unique(index.channel_records["ChannelNumber"])
     by_side: dict[int, list[tuple[float, float, int]]] = {1: [], 2: []}
     kinds = {int(n): _channel_type(index, int(n)) for n in numbers}
-    if not any(kind in by_side for kind in kinds.values()) and len(numbers):
-        side_scan = [int(n) for n in numbers][:2]
-        kinds = dict(zip(side_scan, (1, 2), strict=False))
+    # Careless writers leave every type 0, which says sub-bottom; a pair of those is taken for sides.
+    untyped = [number for number, kind in kinds.items() if kind == 0]
+    if not any(kind in by_side for kind in kinds.values()) and len(untyped) >= 2:
+        kinds = dict(zip(untyped[:2], (1, 2), strict=True))
         defects.append(
             "no channel is declared port or starboard: "
             + " and ".join(f"channel {n} is taken for {_side_name(k)}" for n, k in kinds.items())
