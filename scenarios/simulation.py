@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -191,10 +191,8 @@ def _ping(
     truth = at_times(motion, time_s[keep])
     poses = sonar_poses(motion)
     at_pings = np.column_stack([np.interp(truth.time_s, motion.time_s, c) for c in poses.T])
-    model = sonar_model(scenario.sonar, scenario.world.depth_m)
-    power = facet_echoes(
-        world.floor, world.albedo, at_pings, model, scenario.sonar, progress=progress
-    )
+    model = sonar_model(scenario.sonar, depth_m=scenario.world.depth_m, cell_m=world.floor.cell_m)
+    power = facet_echoes(world.floor, world.albedo, at_pings, model, progress)
     counts = record(
         power,
         model,
@@ -244,15 +242,7 @@ def start_time_s(scenario: Scenario) -> float:
         raise InputError(
             f"mission.start = {text!r}: is no ISO 8601 time; write one as 2026-05-01T08:00:00Z"
         ) from error
-    return float(
-        np.round((moment if moment.tzinfo else moment.replace(tzinfo=_utc())).timestamp(), 2)
-    )
-
-
-def _utc():  # type: ignore[no-untyped-def]
-    from datetime import UTC
-
-    return UTC
+    return float(np.round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp(), 2))
 
 
 def write_simulation(simulation: Simulation, out: Path, progress: Progress = silent) -> None:

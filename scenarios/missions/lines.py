@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -89,7 +90,7 @@ def _direction(line: Line) -> FloatArray:
 def legs_to_lines(legs: Sequence[tuple[float, float]]) -> list[Line]:
     """Return the legs between waypoints as lines that meet end to start, corners cut by 10 %."""
     lines: list[Line] = []
-    for (e0, n0), (e1, n1) in zip(legs[:-1], legs[1:], strict=True):
+    for (e0, n0), (e1, n1) in pairwise(legs):
         de, dn = 0.1 * (e1 - e0), 0.1 * (n1 - n0)
         lines.append((e0 + de, n0 + dn, e1 - de, n1 - dn))
     return lines

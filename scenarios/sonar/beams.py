@@ -31,7 +31,7 @@ def azimuth_nodes(width_rad: float, count: int) -> tuple[FloatArray, FloatArray]
     edges = np.linspace(-1.05 * width_rad, 1.05 * width_rad, count + 1)
     nodes = 0.5 * (edges[1:] + edges[:-1])
     fine = np.linspace(edges[:-1], edges[1:], 65)
-    integrals = np.trapezoid(line_array(fine, width_rad) ** 2, fine, axis=0)
+    integrals = np.asarray(np.trapezoid(line_array(fine, width_rad) ** 2, fine, axis=0))
     return nodes, integrals
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import uniform_filter1d
 
 from perception.records import FloatArray, Grid, Progress, silent
 from scenarios.schema import SonarSection
@@ -21,48 +22,45 @@ _CHUNK = 64
 
 @dataclass(frozen=True, slots=True)
 class SonarModel:
-    """The sonar's constants as the kernel wants them."""
+    """The sonar in its water: beam, number of samples a side, and the water's absorption."""
 
-    sample_m: float
+    beam: kernel.Beam
     samples: int
-    angles_rad: FloatArray
-    weights_rad: FloatArray
-    vertical: FloatArray
-    lobe: float
-    lobe_tan2: float
     absorption_db_m: float
 
     @property
     def slant_range_m(self) -> FloatArray:
         """Return the slant range of each sample's middle."""
-        return (np.arange(self.samples) + 0.5) * self.sample_m
-
-    @property
-    def beam_rad(self) -> float:
-        """Return the two-way horizontal pattern's integral."""
-        return float(self.weights_rad.sum())
+        return (np.arange(self.samples) + 0.5) * self.beam.sample_m
 
 
-def sonar_model(config: SonarSection, depth_m: float) -> SonarModel:
+def sonar_model(config: SonarSection, *, depth_m: float, cell_m: float) -> SonarModel:
     """Derive the sonar's constants from the scenario; absorption is that of mid-water."""
-    angles, weights = beams.azimuth_nodes(np.deg2rad(config.horizontal_beam_deg), config.azimuths)
-    return SonarModel(
-        sample_m=config.range_m / config.samples,
-        samples=config.samples,
-        angles_rad=angles,
-        weights_rad=weights,
+    width = float(np.deg2rad(config.horizontal_beam_deg))
+    angles, weights = beams.azimuth_nodes(width, config.azimuths)
+    beam = kernel.Beam(
+        angles=angles,
+        weights=weights,
+        width=width,
         vertical=beams.vertical_table(
-            np.deg2rad(config.vertical_beam_deg), np.deg2rad(config.tilt_deg)
+            float(np.deg2rad(config.vertical_beam_deg)), float(np.deg2rad(config.tilt_deg))
         ),
+        exponent=config.lambert_exponent,
         lobe=0.0 if config.nadir_lobe_db is None else 10.0 ** (config.nadir_lobe_db / 10.0),
         lobe_tan2=float(np.tan(np.deg2rad(config.nadir_lobe_deg)) ** 2),
-        absorption_db_m=beams.absorption_db_m(
-            config.frequency_khz,
-            temperature_c=config.temperature_c,
-            salinity_psu=config.salinity_psu,
-            depth_m=0.5 * depth_m,
-        ),
+        turns=config.motion_during_echo,
+        sound_speed=config.sound_speed_m_s,
+        sample_m=config.range_m / config.samples,
+        # A step of half a cell meets every height of the raster; longer ones would miss walls.
+        step_m=0.5 * cell_m,
     )
+    absorption = beams.absorption_db_m(
+        config.frequency_khz,
+        temperature_c=config.temperature_c,
+        salinity_psu=config.salinity_psu,
+        depth_m=0.5 * depth_m,
+    )
+    return SonarModel(beam, config.samples, absorption)
 
 
 def facet_echoes(
@@ -70,31 +68,32 @@ def facet_echoes(
     albedo: FloatArray,
     poses: FloatArray,
     model: SonarModel,
-    config: SonarSection,
     progress: Progress = silent,
 ) -> npt.NDArray[np.float32]:
-    """Return the mean echo power (pings, 2, samples) before spreading, port first."""
-    heights = np.ascontiguousarray(floor.elevation_m, np.float64)
+    """Return the mean echo power (pings, 2, samples) before spreading, port first.
+
+    `albedo` (rows, cols) is the floor's scattering strength as a power ratio; `poses` (pings, 10)
+    has the columns of `scenarios.sonar.kernel.POSE`. Pings are independent, so the number of threads
+    does not change a bit.
+    """
+    ground = kernel.Floor(
+        np.ascontiguousarray(floor.elevation_m, np.float64),
+        np.ascontiguousarray(albedo, np.float64),
+        floor.west_m,
+        floor.north_m,
+        floor.cell_m,
+    )
     power = np.zeros((len(poses), 2, model.samples), np.float32)
-    # A step of half a cell sees every height of the raster; longer ones would miss walls.
-    step_m = 0.5 * floor.cell_m
 
-    def work(rows: slice) -> int:
+    def work(rows: slice) -> slice:
         part = np.zeros((rows.stop - rows.start, 2, model.samples))
-        kernel.ping_echoes(
-            heights, albedo, floor.west_m, floor.north_m, floor.cell_m, poses[rows],
-            model.angles_rad, model.weights_rad, model.vertical, step_m, model.sample_m,
-            config.lambert_exponent, model.lobe, model.lobe_tan2, config.motion_during_echo,
-            config.sound_speed_m_s, part,
-        )  # fmt: skip
+        kernel.ping_echoes(ground, model.beam, poses[rows], part)
         power[rows] = part
-        return int(rows.stop)
+        return rows
 
-    done = 0
     with ThreadPoolExecutor(_threads()) as pool:
-        for rows, _ in zip(_chunks(len(poses)), pool.map(work, _chunks(len(poses))), strict=True):
-            done += rows.stop - rows.start
-            progress("pinging", done, len(poses))
+        for rows in pool.map(work, _chunks(len(poses))):
+            progress("pinging", rows.stop, len(poses))
     return power
 
 
@@ -130,7 +129,9 @@ def record(
     gain = slant ** (config.tvg_log / 10.0) * 10.0 ** (
         0.2 * model.absorption_db_m * config.tvg_absorption_scale * slant
     )
-    nominal = loss * _flat(model, config, altitude_m, slant)
+    # A range that does not reach the floor at this altitude still needs a reference.
+    reach_m = min(altitude_m, 0.6 * float(slant[-1]))
+    nominal = loss * kernel.floor_power(slant, reach_m, model.beam)
     noise = nominal[-1] * 10.0 ** (-config.snr_db / 10.0)
     echo = power * loss.astype(np.float32)
     echo += _leakage(echo, config.leakage_db)
@@ -150,25 +151,8 @@ def record(
     return np.minimum(np.rint(amplitude), 65535).astype(np.uint16)
 
 
-def _flat(
-    model: SonarModel, config: SonarSection, altitude_m: float, slant: FloatArray
-) -> FloatArray:
-    return kernel.floor_power(
-        slant,
-        altitude_m=min(altitude_m, 0.6 * float(slant[-1])),
-        sample_m=model.sample_m,
-        beam_rad=model.beam_rad,
-        vertical=model.vertical,
-        exponent=config.lambert_exponent,
-        lobe=model.lobe,
-        lobe_tan2=model.lobe_tan2,
-    )
-
-
 def _leakage(echo: npt.NDArray[np.float32], leakage_db: float) -> npt.NDArray[np.float32]:
     """Return what the side lobes of the beam bring in: the echo of the pings around, weakened."""
-    from scipy.ndimage import uniform_filter1d
-
     around = uniform_filter1d(echo, 41, axis=0, mode="nearest")
     around = uniform_filter1d(around, 9, axis=2, mode="nearest").mean(axis=1, keepdims=True)
     leak: npt.NDArray[np.float32] = around * np.float32(10.0 ** (leakage_db / 10.0))
