@@ -1,0 +1,132 @@
+"""`bathynav regions MAP.tif --out DIR`: segment a map by the curvature of its surface."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from scenarios.commands.console import (
+    common_options,
+    out_option,
+    prepare_out,
+    print_table,
+    progress_bars,
+    set_verbosity,
+)
+
+if TYPE_CHECKING:
+    from perception.regions import Segmentation
+
+
+@click.command()
+@click.argument("map_path", metavar="MAP.tif", type=click.Path(path_type=Path))
+@out_option
+@click.option(
+    "--scale",
+    "scale_m",
+    type=float,
+    help="Smoothing for the whole map (Gaussian sigma, m); chosen per cell if left out.",
+)
+@click.option("--map-sigma", "map_sigma_m", type=float, help="1-sigma of the heights, m.")
+@click.option("--levels", type=click.IntRange(1, 8), default=1, show_default=True,
+              help="Levels of detail; each coarser one doubles the scale.")  # fmt: skip
+@click.option("--objects", "objects_path", type=click.Path(path_type=Path),
+              help="Objects (objects.gpkg or .csv) to lift off the surface first.")  # fmt: skip
+@common_options
+def command(
+    map_path: Path,
+    out: Path,
+    scale_m: float | None,
+    map_sigma_m: float | None,
+    levels: int,
+    objects_path: Path | None,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Segment a map into peaks, pits, ridges, valleys, saddles and flats.
+
+    Writes regions.tif, regions.gpkg, curvature.tif, pictures and metrics.json.
+
+    \b
+    bathynav regions map.tif --out regions
+    bathynav regions map.tif --out regions --scale 10 --levels 3
+    """
+    from dataclasses import asdict
+    from time import perf_counter
+
+    from mapping.rasters import read_map
+    from mapping.region_files import write_segmentation
+    from perception.records import InputError
+    from perception.regions import RegionConfig, segment
+    from scenarios.outputs import write_metrics
+    from scenarios.plots_regions import plot_legend, plot_regions
+
+    set_verbosity(quiet, verbose)
+    if map_sigma_m is not None and not map_sigma_m >= 0:
+        raise InputError(f"--map-sigma must be zero or more metres, got {map_sigma_m}")
+    config = RegionConfig(scale_m=scale_m, levels=levels)
+    grid = read_map(map_path, map_sigma_m)
+    prepare_out(out)
+    start = perf_counter()
+    with progress_bars(quiet) as progress:
+        result = segment(grid, config, progress)
+        seconds = perf_counter() - start
+        write_segmentation(out, result)
+        plot_regions(out / "regions.png", grid, result.regions, map_path.name)
+        plot_legend(out / "legend.png")
+    metrics = _metrics(result, seconds)
+    write_metrics(out, metrics, {**asdict(config), "map": str(map_path)})
+    if not quiet:
+        _print(result, metrics, out)
+
+
+def _metrics(result: Segmentation, seconds: float) -> dict[str, Any]:
+    import numpy as np
+
+    from perception.records import REGION_CLASSES
+
+    regions, curvature = result.regions, result.curvature
+    known = regions.class_code > 0
+    cells = max(int(known.sum()), 1)
+    metrics: dict[str, Any] = {
+        "cells": int(known.sum()),
+        "regions": len(regions.table["area_m2"]),
+        "borders": len(regions.border_m),
+        "scale_median_m": float(np.median(curvature.scale_m[known])),
+        "noise_median_m": float(np.median(curvature.noise_m[known])),
+        "class_probability_mean": float(
+            np.average(regions.table["class_probability"], weights=regions.table["area_m2"])
+        ),
+        "seconds": seconds,
+    }
+    for code, name in enumerate(REGION_CLASSES[1:], start=1):
+        share = np.count_nonzero(regions.class_code == code) / cells
+        metrics[f"share_{name.replace(' ', '_')}"] = share
+    for level, coarse in enumerate(result.coarser, start=2):
+        metrics[f"regions_level_{level}"] = len(coarse.table["area_m2"])
+    return metrics
+
+
+def _print(result: Segmentation, metrics: dict[str, Any], out: Path) -> None:
+    import numpy as np
+
+    from perception.records import REGION_CLASSES
+
+    rows = [
+        ("regions", f"{metrics['regions']} ({metrics['borders']} borders)"),
+        ("smoothing (median)", f"{metrics['scale_median_m']:.3g} m"),
+        ("independent noise (median)", f"{metrics['noise_median_m']:.3g} m"),
+    ]
+    codes = result.regions.table["class_code"]
+    for code, name in enumerate(REGION_CLASSES[1:], start=1):
+        share = metrics[f"share_{name.replace(' ', '_')}"]
+        rows.append((name, f"{100 * share:5.1f} % in {np.count_nonzero(codes == code)} regions"))
+    rows.extend(
+        (f"level {level}", f"{len(coarse.table['area_m2'])} regions")
+        for level, coarse in enumerate(result.coarser, start=2)
+    )
+    rows.append(("seconds", f"{metrics['seconds']:.2f}"))
+    print_table(f"regions of {metrics['cells']} cells", rows)
+    print_table("written", [("to", str(out))])
