@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 # name -> (module below scenarios.benchmarks, what it measures)
-BENCHMARKS: dict[str, tuple[str, str]] = {}
+BENCHMARKS: dict[str, tuple[str, str]] = {
+    "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
+}
 
 
 @dataclass(frozen=True, slots=True)

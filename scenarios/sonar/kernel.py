@@ -110,8 +110,10 @@ def _walk(
     row0 = (floor.north_m - pose[1]) / floor.cell_m - 0.5
     col0 = (pose[0] - floor.west_m) / floor.cell_m - 0.5
     height, slope_u = _height_and_slope(floor, row0, col0, attitude)
+    u = (pose[2] - height) * attitude.sin_p / attitude.cos_p
+    row, col = row0 - u * attitude.cos_h / floor.cell_m, col0 + u * attitude.sin_h / floor.cell_m
+    height, slope_u = _height_and_slope(floor, row, col, attitude)
     drop = max(pose[2] - height, 0.05)
-    u = drop * attitude.sin_p / attitude.cos_p
     v, slant, horizon = 0.0, np.hypot(drop, u), -1e30
     # Inward it is walked to 45 degrees past the nadir, outward until no slant range can be shorter.
     limit = power.shape[0] * beam.sample_m if outward > 0 else drop
