@@ -35,28 +35,46 @@ def near_end_evidence(rows: Iterable[FloatArray], hint_fraction: Iterable[float]
     float
         Positive near to far, negative far to near, 0 undecided.
     """
-    gains, hinted = [], []
-    for row, fraction in zip(rows, hint_fraction, strict=True):
-        level = _block_levels(np.asarray(row, float))
-        if level is None:
-            continue
-        gains.append(_greatest_step(level) - _greatest_step(level[::-1]))
-        if np.isfinite(fraction) and 0.02 < fraction < 0.9:
-            at = round(fraction * _BLOCKS)
-            hinted.append(_step_at(level, at) - _step_at(level[::-1], at))
-    if not gains:
+    judged = [
+        (level, fraction)
+        for level, fraction in zip(map(_block_levels, rows), hint_fraction, strict=True)
+        if level is not None
+    ]
+    if not judged:
         return 0.0
+    levels = np.array([level for level, _ in judged])
+    gains = _greatest_step(levels)[0] - _greatest_step(levels[:, ::-1])[0]
     evidence = float(np.median(gains))
     agreeing = float(np.mean(np.sign(gains) == np.sign(evidence)))
     if abs(evidence) >= _SURE and agreeing >= 0.7:
         return evidence
+    hinted = [
+        _step_at(level, round(fraction * _BLOCKS))
+        - _step_at(level[::-1], round(fraction * _BLOCKS))
+        for level, fraction in judged
+        if np.isfinite(fraction) and 0.02 < fraction < 0.9
+    ]
     by_hint = float(np.median(hinted)) if hinted else 0.0
     return by_hint if abs(by_hint) >= _SURE else 0.0
 
 
+def first_return_fractions(rows: Iterable[FloatArray]) -> FloatArray:
+    """Return where each row (near to far) steps from quiet to loud, as a share of its length.
+
+    A crude first return, for telling whether an altitude field can be true; NaN where no step shows.
+    """
+    levels = [_block_levels(row) for row in rows]
+    out = np.full(len(levels), np.nan)
+    known = [i for i, level in enumerate(levels) if level is not None]
+    if known:
+        step, at = _greatest_step(np.array([levels[i] for i in known]), after=2)
+        out[known] = np.where(step > _SURE, at / _BLOCKS, np.nan)
+    return out
+
+
 def _block_levels(row: FloatArray) -> FloatArray | None:
-    """Return the log of the row's block means; None where the row holds no echo."""
-    row = np.where(np.isfinite(row), np.abs(row), 0.0)
+    """Return the log of the row's block means (128,); None where the row holds no echo."""
+    row = np.where(np.isfinite(row), np.abs(row), 0.0).astype(float)
     mean = row.mean() if len(row) >= _BLOCKS // 4 else 0.0
     if mean <= 0:
         return None
@@ -68,32 +86,21 @@ def _block_levels(row: FloatArray) -> FloatArray | None:
     return np.asarray(np.log(blocks + 1e-3 * mean))
 
 
-def _greatest_step(level: FloatArray) -> float:
-    """Return the greatest rise from the upper quartile of all before to the mean just after."""
-    best = 0.0
-    for at in range(_SKIP + 2, _DEEPEST):
-        before = np.sort(level[_SKIP:at])[(at - _SKIP) * 3 // 4]
-        best = max(best, level[at : at + _AFTER].mean() - before)
-    return float(best)
+def _greatest_step(levels: FloatArray, after: int = _AFTER) -> tuple[FloatArray, FloatArray]:
+    """Return the greatest rise (n,) from the upper quartile of all before to the mean just after.
 
-
-def first_return_fraction(row: FloatArray) -> float:
-    """Return where a row (near to far) steps from quiet to loud, as a share of its length.
-
-    A crude first return, for telling whether an altitude field can be true; NaN where no step shows.
+    Also the block (n,) where it is.
     """
-    level = _block_levels(np.asarray(row, float))
-    if level is None:
-        return float("nan")
-    best, where = _SURE, float("nan")
-    for at in range(_SKIP + 2, _DEEPEST):
-        before = np.sort(level[_SKIP:at])[(at - _SKIP) * 3 // 4]
-        step = level[at : at + 2].mean() - before
-        if step > best:
-            best, where = step, at / _BLOCKS
-    return where
+    rises = np.empty((len(levels), _DEEPEST - _SKIP - 2))
+    for column, at in enumerate(range(_SKIP + 2, _DEEPEST)):
+        rank = (at - _SKIP) * 3 // 4
+        before = np.partition(levels[:, _SKIP:at], rank, axis=1)[:, rank]
+        rises[:, column] = levels[:, at : at + after].mean(axis=1) - before
+    best = rises.argmax(axis=1)
+    return np.maximum(rises.max(axis=1), 0.0), best + _SKIP + 2.0
 
 
 def _step_at(level: FloatArray, at: int) -> float:
+    """Return the rise at a block from a little before to a little after."""
     before = level[max(at - 2 * _AFTER, _SKIP) : max(at - 1, _SKIP + 1)]
     return float(level[at : at + 2 * _AFTER].mean() - before.mean())

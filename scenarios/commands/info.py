@@ -17,7 +17,7 @@ from scenarios.commands.console import (
 
 if TYPE_CHECKING:
     from perception.readers import RawFile, Survey
-    from perception.records import Progress
+    from perception.records import FloatArray, IntArray, Progress
 
 
 @click.command()
@@ -167,7 +167,7 @@ def _altitude_defect(survey: Survey) -> list[str]:
     """Compare the altitude field with the echoes' own first return, on some pings of the file."""
     import numpy as np
 
-    from perception.readers.orientation import first_return_fraction
+    from perception.readers.orientation import first_return_fractions
     from perception.readers.raw import spread_rows
 
     table = survey.pings
@@ -179,8 +179,9 @@ def _altitude_defect(survey: Survey) -> list[str]:
     swath = survey.read(rows)
     returns = np.full((2, len(rows)), np.nan)
     for side, levels in enumerate((swath.port, swath.starboard)):
-        for line, count in enumerate(table.samples[rows]):
-            returns[side, line] = first_return_fraction(levels[line, :count]) * count
+        counts = table.samples[rows]
+        echoes = [line[:count] for line, count in zip(levels, counts, strict=True)]
+        returns[side] = first_return_fractions(echoes) * counts
     returns *= swath.sample_m
     ratio = returns / swath.altitude_hint_m
     ratio = ratio[np.isfinite(ratio)]
@@ -194,14 +195,14 @@ def _altitude_defect(survey: Survey) -> list[str]:
     ]
 
 
-def _length_m(survey: Survey, rows: object) -> float:
+def _length_m(survey: Survey, rows: IntArray) -> float:
     import numpy as np
 
     east, north = survey.pings.easting_m[rows], survey.pings.northing_m[rows]
     return float(np.hypot(np.diff(east), np.diff(north)).sum())
 
 
-def _span(values: object, unit: str, digits: int) -> str:
+def _span(values: FloatArray | IntArray, unit: str, digits: int) -> str:
     import numpy as np
 
     finite = np.asarray(values, float)
