@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 # name -> (module below scenarios.benchmarks, what it measures)
 BENCHMARKS: dict[str, tuple[str, str]] = {
+    "experiments": ("experiments", "the experiment runner: overhead, memory, sameness"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
 }
 
