@@ -84,18 +84,14 @@ def track_bottom(
     BottomTrack
     """
     config = config or BottomConfig()
-    sides = [
-        _log_power(side) for side in (port_power, starboard_power) if np.isfinite(side).any()
-    ]
+    sides = [_log_power(side) for side in (port_power, starboard_power) if np.isfinite(side).any()]
     n, m = port_power.shape
     if not sides:
         nothing = np.full(n, np.nan)
         return BottomTrack(nothing, nothing.copy(), nothing.copy(), np.zeros(n, bool))
     nearest = max(2, round((config.min_altitude_m or 6 * sample_m) / sample_m))
     coarse, contrast = _coarse_track(sides, nearest, config)
-    firsts, noise = zip(
-        *(_refine(side, coarse, nearest, config) for side in sides), strict=True
-    )
+    firsts, noise = zip(*(_refine(side, coarse, nearest, config) for side in sides), strict=True)
     valid = _is_valid(contrast)
     return _assemble(np.array(firsts), np.array(noise), valid, sample_m, altitude_hint_m, config)
 
@@ -104,7 +100,11 @@ def _log_power(power: FloatArray) -> FloatArray:
     """Return log power with a floor, so that stored zeros are dark and not minus infinity."""
     finite = power[np.isfinite(power)]
     positive = finite[finite > 0]
-    floor = max(0.25 * float(positive.min()), 1e-7 * float(np.median(positive))) if len(positive) else 1.0
+    floor = (
+        max(0.25 * float(positive.min()), 1e-7 * float(np.median(positive)))
+        if len(positive)
+        else 1.0
+    )
     return np.log(np.maximum(power, floor), dtype=np.float32)
 
 
@@ -165,8 +165,12 @@ def _levels(
             water[j] = np.median(image[in_water[:, j], j])
         if in_floor[:, j].sum() >= max(5, n // 50):
             floor[j] = np.median(image[in_floor[:, j], j])
-    water = _filled(water, float(np.median(image[in_water])) if in_water.any() else float(image.min()))
-    floor = _filled(floor, float(np.median(image[in_floor])) if in_floor.any() else float(image.max()))
+    water = _filled(
+        water, float(np.median(image[in_water])) if in_water.any() else float(image.min())
+    )
+    floor = _filled(
+        floor, float(np.median(image[in_floor])) if in_floor.any() else float(image.max())
+    )
     floor = np.maximum(floor, water + 0.5)
     residual = np.abs(image - np.where(in_floor, floor, water))[in_water | in_floor]
     spread = 1.48 * float(np.median(residual)) if len(residual) else 1.0
@@ -374,9 +378,7 @@ def _carried(
     return altitude, first, np.where(valid, sigma_m, np.hypot(sigma_m, spread))
 
 
-def _hint_scale(
-    hint_m: FloatArray, altitude_m: FloatArray
-) -> tuple[FloatArray | None, float]:
+def _hint_scale(hint_m: FloatArray, altitude_m: FloatArray) -> tuple[FloatArray | None, float]:
     """Fit ``altitude = a * hint + b`` robustly; None where the hint says nothing."""
     good = np.isfinite(hint_m) & (hint_m > 0)
     if good.sum() < 20 or np.ptp(hint_m[good]) < 1e-6:

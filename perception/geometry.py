@@ -37,9 +37,7 @@ def along_track(easting_m: FloatArray, northing_m: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(steps), steps, 0.0))])
 
 
-def progress_along(
-    easting_m: FloatArray, northing_m: FloatArray, time_s: FloatArray
-) -> FloatArray:
+def progress_along(easting_m: FloatArray, northing_m: FloatArray, time_s: FloatArray) -> FloatArray:
     """Return a strictly rising distance (n,) along a pass, metres, that jitter does not lengthen.
 
     Positions are projected on the pass's smoothed course; repeated fixes (navigation slower than

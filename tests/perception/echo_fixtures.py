@@ -57,9 +57,7 @@ def cylinder(height_m: float, x0: float, y0: float, radius_m: float) -> Height:
 
 def boulder(radius_m: float, x0: float, y0: float) -> Height:
     """Return a half sphere on a flat floor."""
-    return lambda x, y: np.sqrt(
-        np.maximum(radius_m**2 - (x - x0) ** 2 - (y - y0) ** 2, 0.0)
-    )
+    return lambda x, y: np.sqrt(np.maximum(radius_m**2 - (x - x0) ** 2 - (y - y0) ** 2, 0.0))
 
 
 def echo_power(height: Height, y: float, altitude_m: float, side: int, s: Survey) -> FloatArray:

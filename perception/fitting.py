@@ -1,0 +1,135 @@
+"""Fit one shadow's surroundings with the bump-or-pit model: height, shape, place, and their covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perception.records import FloatArray
+from perception.silhouettes import N_PARAMETERS, fisher_step, log_likelihood
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """The equalised echo around one shadow, averaged to a workable size.
+
+    Attributes
+    ----------
+    ratio : (n, m) float64 power over nominal; NaN says nothing.
+    along_m, drop_m : (n,) place along the track and height of the sonar above the floor.
+    start_m, step_m : near edge of the first bin and width of a bin, slant.
+    weight : looks times independent part of one cell.
+    leak : level inside shadows.
+    """
+
+    ratio: FloatArray
+    along_m: FloatArray
+    drop_m: FloatArray
+    start_m: float
+    step_m: float
+    weight: float
+    leak: float
+
+
+@dataclass(frozen=True, slots=True)
+class BumpFit:
+    """The best bump (`sign` 1) or pit (-1): parameters x0, y0, log|A|, log sx, log sy, log beta.
+
+    `gain` is the log likelihood over that of a flat floor, priors included.
+    """
+
+    parameters: FloatArray
+    covariance: FloatArray
+    sign: float
+    gain: float
+
+    @property
+    def height_m(self) -> float:
+        """Return the extreme height or depth; positive for either kind."""
+        return float(np.exp(self.parameters[2]))
+
+
+# A highlight above this many times nominal is "bright" and no more.
+HIGHLIGHT_CAP = 4.0
+# Priors in logarithms: objects are about as long as wide; shapes lie between a Gaussian and a flat top.
+_ASPECT_SIGMA = 0.5
+_SHAPE_MEAN, _SHAPE_SIGMA = float(np.log(1.7)), 0.6
+_SHAPE_BOUNDS = (float(np.log(0.8)), float(np.log(8.0)))
+_FACETS_PER_BIN = 1.5
+_ROUNDS = 40
+
+
+def fit_patch(patch: Patch, starts: list[tuple[float, FloatArray]]) -> BumpFit | None:
+    """Return the most likely fit over all starts (sign, parameters), or None where none converges."""
+    flat_value = _flat_likelihood(patch)
+    fits = [_climb(patch, sign, start, flat_value) for sign, start in starts]
+    found = [fit for fit in fits if fit is not None]
+    return max(found, key=lambda fit: fit.gain) if found else None
+
+
+def _flat_likelihood(patch: Patch) -> float:
+    e = np.minimum(patch.ratio[np.isfinite(patch.ratio)], HIGHLIGHT_CAP)
+    mean = 1.0 + patch.leak
+    return float(-patch.weight * (e / mean + np.log(mean)).sum())
+
+
+def _prior(parameters: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Return log prior, its gradient and its information."""
+    gradient = np.zeros(N_PARAMETERS)
+    information = np.zeros((N_PARAMETERS, N_PARAMETERS))
+    aspect = (parameters[3] - parameters[4]) / _ASPECT_SIGMA**2
+    shape = (parameters[5] - _SHAPE_MEAN) / _SHAPE_SIGMA**2
+    gradient[3], gradient[4], gradient[5] = -aspect, aspect, -shape
+    information[3:5, 3:5] = np.array([[1, -1], [-1, 1]]) / _ASPECT_SIGMA**2
+    information[5, 5] = 1 / _SHAPE_SIGMA**2
+    value = -0.5 * (
+        aspect * (parameters[3] - parameters[4]) + shape * (parameters[5] - _SHAPE_MEAN)
+    )
+    return float(value), gradient, information
+
+
+def _climb(patch: Patch, sign: float, start: FloatArray, flat_value: float) -> BumpFit | None:
+    """Climb the posterior from `start` by damped Fisher scoring."""
+    ground_far = np.sqrt(
+        max(
+            (patch.start_m + patch.ratio.shape[1] * patch.step_m) ** 2 - patch.drop_m.mean() ** 2,
+            1e-2,
+        )
+    )
+    slant_far = patch.start_m + patch.ratio.shape[1] * patch.step_m
+    facet_m = patch.step_m * slant_far / ground_far / _FACETS_PER_BIN
+    fixed = (patch.drop_m, patch.along_m, patch.start_m, patch.step_m, patch.leak, facet_m,
+             HIGHLIGHT_CAP, patch.weight)  # fmt: skip
+    at = start.copy()
+    damping = 1e-2
+    value, gradient, information = fisher_step(at, sign, patch.ratio, *fixed)
+    prior_value, prior_gradient, prior_information = _prior(at)
+    for _ in range(_ROUNDS):
+        whole = information + prior_information
+        scale = np.diag(np.diag(whole) * damping + 1e-6)
+        step = np.linalg.solve(whole + scale, gradient + prior_gradient)
+        # A logarithm moves by half at most, a place by the object's own width: the model is not linear.
+        width = np.exp(at[3:5])
+        step = np.clip(
+            step, -np.array([*width, 0.5, 0.5, 0.5, 0.7]), np.array([*width, 0.5, 0.5, 0.5, 0.7])
+        )
+        trial = at + step
+        trial[5] = np.clip(trial[5], *_SHAPE_BOUNDS)
+        trial_value = log_likelihood(trial, sign, patch.ratio, *fixed)
+        trial_prior = _prior(trial)
+        rise = trial_value + trial_prior[0] - value - prior_value
+        if rise > 0:
+            at, damping = trial, max(damping * 0.3, 1e-4)
+            value, gradient, information = fisher_step(at, sign, patch.ratio, *fixed)
+            prior_value, prior_gradient, prior_information = trial_prior
+            if rise < 0.02:
+                break
+        else:
+            damping *= 6
+            if damping > 1e4:
+                break
+    covariance = np.linalg.pinv(information + prior_information)
+    if not np.all(np.isfinite(covariance)) or not np.all(np.isfinite(at)):
+        return None
+    return BumpFit(at, covariance, sign, float(value + prior_value - flat_value))

@@ -1,0 +1,301 @@
+"""Strips: one pass's echoes to its elevation strip, stage after stage.
+
+bottom track -> equalised echo -> levels -> shadows and objects -> levelled contour lines
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perception.bottom import BottomConfig, BottomTrack, track_bottom
+from perception.contours import Roughness, floor_beside, learn_roughness, level_lines
+from perception.gain import Equalised, GainConfig, equalise
+from perception.geometry import ground_range, progress_along, resample_rows
+from perception.levels import NO_DATA, SHADOW, LevelConfig, Levels, segment_levels
+from perception.objects import ObjectConfig, ObjectRow, ObjectTable, Track, find_objects
+from perception.records import ElevationStrip, FloatArray, InputError, IntArray, Swath
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class StripConfig:
+    """Settings of the way from echoes to a strip.
+
+    Attributes
+    ----------
+    cell_m : width of the strip's columns across the track; None takes twice the sample, no more than
+        500 columns a side.
+    bottom, gain, levels, objects : settings of the stages.
+    """
+
+    cell_m: float | None = None
+    bottom: BottomConfig = field(default_factory=BottomConfig)
+    gain: GainConfig = field(default_factory=GainConfig)
+    levels: LevelConfig = field(default_factory=LevelConfig)
+    objects: ObjectConfig = field(default_factory=ObjectConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class PassResult:
+    """All that one pass gave.
+
+    Attributes
+    ----------
+    strip : heights with sigma.
+    objects : objects and craters.
+    bottom : altitude, sigma, first return, validity per ping.
+    echo : (port, starboard) equalised power ratio (n, m), 1 nominal; NaN no data.
+    levels : (port, starboard) int8 labels (n, m): 0 nominal, 1 highlight, -1 shadow, -2 no data.
+    sample_m : slant range of a sample of `echo` and `levels` (one for the whole pass; pings recorded
+        with another are resampled).
+    along_m : (n,) distance along the pass.
+    roughness : variogram of the floor, learned from the soundings.
+    flags : (n,) int, 1 where no bottom was seen; the swath's own flags shifted left by one bit.
+    """
+
+    strip: ElevationStrip
+    objects: ObjectTable
+    bottom: BottomTrack
+    echo: tuple[FloatArray, FloatArray]
+    levels: tuple[IntArray, IntArray]
+    sample_m: float
+    along_m: FloatArray
+    roughness: Roughness
+    flags: IntArray
+
+
+def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
+    """Turn the pings of one pass into its elevation strip and objects.
+
+    Raises
+    ------
+    InputError
+        The pass has fewer than 10 pings or no echo above the noise to track a bottom in.
+    """
+    config = config or StripConfig()
+    if swath.n_pings < 10:
+        raise InputError(
+            f"{swath.source or 'swath'}: pass {swath.pass_index} has {swath.n_pings} usable pings; "
+            "at least 10 are needed"
+        )
+    port, starboard, sample_m = common_samples(swath)
+    bottom = track_bottom(port, starboard, sample_m, swath.altitude_hint_m, config.bottom)
+    if not bottom.valid.any():
+        raise InputError(
+            f"{swath.source or 'swath'}: pass {swath.pass_index} shows no bottom in "
+            f"{swath.n_pings} pings; is this a side-scan channel?"
+        )
+    along_m = progress_along(swath.easting_m, swath.northing_m, swath.time_s)
+    depth_m = _depth(swath)
+    # Heights along the line of soundings, levelled over all lines at once.
+    sounded = -(depth_m + bottom.altitude_m)
+    reach = sample_m * port.shape[1]
+    rough = learn_roughness(sounded, bottom.sigma_m, along_m, reach)
+    line_m, line_sigma = level_lines(sounded, bottom.sigma_m, along_m, rough)
+    altitude_m = -depth_m - line_m
+    level = BottomTrack(altitude_m, line_sigma, bottom.first_return_m, bottom.valid)
+    track = Track(along_m, altitude_m, line_sigma, swath.easting_m, swath.northing_m,
+                  swath.heading_rad, swath.ping)  # fmt: skip
+    sides, rows = [], []
+    for side, power in ((-1, port), (1, starboard)):
+        equalised = equalise(power, sample_m, bottom.first_return_m, altitude_m,
+                             side * swath.roll_rad, config.gain)  # fmt: skip
+        levels = segment_levels(equalised.ratio, equalised.looks, config.levels)
+        rows += find_objects(equalised.ratio, levels, sample_m, side, track, swath.pass_index,
+                             _floor_sigma(rough, sample_m, power.shape[1], altitude_m), config.objects)  # fmt: skip
+        sides.append((equalised, levels))
+    rows.sort(key=lambda row: row.ping)
+    strip = _strip(
+        swath, level, along_m, depth_m, line_m, line_sigma, sides, sample_m, rough, rows, config
+    )
+    flags = np.where(bottom.valid, 0, 1)
+    if swath.flags is not None:
+        flags = flags | (np.asarray(swath.flags) << 1)
+    return PassResult(
+        strip=strip,
+        objects=ObjectTable.of(rows),
+        bottom=level,
+        echo=(sides[0][0].ratio, sides[1][0].ratio),
+        levels=(sides[0][1].label, sides[1][1].label),
+        sample_m=sample_m,
+        along_m=along_m,
+        roughness=rough,
+        flags=flags,
+    )
+
+
+def common_samples(swath: Swath) -> tuple[FloatArray, FloatArray, float]:
+    """Return port and starboard *power* (n, m) on one sample size, and that size.
+
+    The commonest (median) sample size of the pass; pings recorded otherwise are resampled.
+    """
+    own = np.asarray(swath.sample_m, float)
+    common = float(np.median(own))
+    port, starboard = (np.square(side, dtype=np.float32) for side in (swath.port, swath.starboard))
+    if np.allclose(own, common, rtol=1e-5):
+        return port, starboard, common
+    count = int(np.ceil(float(own.max()) * swath.n_samples / common))
+    return (
+        resample_rows(port, own, common, count),
+        resample_rows(starboard, own, common, count),
+        common,
+    )
+
+
+def _depth(swath: Swath) -> FloatArray:
+    """Return the sonar's depth (n,); zero, with one warning, where the file has none."""
+    depth = np.asarray(swath.depth_m, float)
+    known = np.isfinite(depth)
+    if not known.any() or np.all(depth[known] == 0):
+        logger.warning(
+            "%s: pass %d has no depth of the sonar; elevations are relative to the sonar",
+            swath.source or "swath", swath.pass_index,
+        )  # fmt: skip
+        return np.zeros(len(depth))
+    index = np.arange(len(depth))
+    return np.interp(index, index[known], depth[known])
+
+
+def _floor_sigma(
+    rough: Roughness, sample_m: float, count: int, altitude_m: FloatArray
+) -> FloatArray:
+    """Return the 1-sigma (count,) of the floor at each slant sample against the floor below the sonar."""
+    slant = (np.arange(count) + 0.5) * sample_m
+    ground = np.nan_to_num(ground_range(slant, np.median(altitude_m)), nan=0.0)
+    return np.sqrt(rough.variogram(ground))
+
+
+def _strip(
+    swath: Swath,
+    bottom: BottomTrack,
+    along_m: FloatArray,
+    depth_m: FloatArray,
+    line_m: FloatArray,
+    line_sigma: FloatArray,
+    sides: list[tuple[Equalised, Levels]],
+    sample_m: float,
+    rough: Roughness,
+    rows: list[ObjectRow],
+    config: StripConfig,
+) -> ElevationStrip:
+    """Lay floor, objects, echo and shadow on the strip's columns."""
+    across = _columns(sides, sample_m, bottom.altitude_m, config.cell_m)
+    distance = np.unique(np.abs(across))
+    floor, sigma = floor_beside(line_m, line_sigma, along_m, distance, rough)
+    at = np.searchsorted(distance, np.abs(across))
+    elevation, sigma = floor[:, at], sigma[:, at]
+    echo, shadow, seen = _on_columns(sides, across, bottom.altitude_m, sample_m)
+    for row in rows:
+        _add_object(elevation, sigma, row, across, along_m)
+    # Ground in shadow was not heard: the object's own sigma at least.
+    elevation = np.where(seen, elevation, np.nan)
+    sigma = np.where(seen, sigma, np.nan)
+    return ElevationStrip(
+        elevation_m=elevation.astype(np.float32),
+        sigma_m=sigma.astype(np.float32),
+        across_m=across,
+        echo=echo,
+        shadow=shadow,
+        time_s=swath.time_s,
+        ping=swath.ping,
+        easting_m=swath.easting_m,
+        northing_m=swath.northing_m,
+        depth_m=depth_m,
+        heading_rad=swath.heading_rad,
+        altitude_m=bottom.altitude_m,
+        altitude_sigma_m=line_sigma,
+        crs=swath.crs,
+        source=swath.source,
+        pass_index=swath.pass_index,
+    )
+
+
+def _columns(
+    sides: list[tuple[Equalised, Levels]],
+    sample_m: float,
+    altitude_m: FloatArray,
+    cell_m: float | None,
+) -> FloatArray:
+    """Return the columns' across-track places, symmetric about the track where both sides are there."""
+    reach = []
+    for equalised, _ in sides:
+        heard = np.flatnonzero(np.isfinite(equalised.ratio).any(axis=0))
+        slant = (heard[-1] + 1) * sample_m if len(heard) else 0.0
+        least = float(np.min(altitude_m))
+        reach.append(float(np.sqrt(max(slant**2 - least**2, 0.0))))
+    cell = cell_m or max(2 * sample_m, max(reach) / 500)
+    left, right = (int(np.floor(r / cell)) for r in reach)
+    return (np.arange(-left, right) + 0.5) * cell
+
+
+def _on_columns(
+    sides: list[tuple[Equalised, Levels]],
+    across: FloatArray,
+    altitude_m: FloatArray,
+    sample_m: float,
+) -> tuple[FloatArray, np.ndarray, np.ndarray]:
+    """Return echo (n, m), shadow and seen masks on the strip's columns, over a flat floor."""
+    n, m = len(altitude_m), len(across)
+    echo = np.full((n, m), np.nan, np.float32)
+    shadow, seen = np.zeros((n, m), bool), np.zeros((n, m), bool)
+    cell = across[1] - across[0] if m > 1 else sample_m
+    for (equalised, levels), columns in zip(sides, (across < 0, across > 0), strict=True):
+        if not columns.any():
+            continue
+        x = np.abs(across[columns])
+        # Mean echo over a column's samples, by running sums: speckle falls and no sample is dropped.
+        known = np.isfinite(equalised.ratio)
+        sums = np.concatenate(
+            [np.zeros((n, 1)), np.cumsum(np.where(known, equalised.ratio, 0), axis=1, dtype=float)],
+            axis=1,
+        )
+        counts = np.concatenate(
+            [np.zeros((n, 1), np.int32), np.cumsum(known, axis=1, dtype=np.int32)], axis=1
+        )
+        width = equalised.ratio.shape[1]
+        inner = np.hypot(np.maximum(x - cell / 2, 0), altitude_m[:, None]) / sample_m
+        outer = np.hypot(x + cell / 2, altitude_m[:, None]) / sample_m
+        low = np.clip(np.floor(inner), 0, width - 1).astype(np.int32)
+        high = np.clip(np.maximum(np.ceil(outer), low + 1), 1, width).astype(np.int32)
+        number = np.take_along_axis(counts, high, 1) - np.take_along_axis(counts, low, 1)
+        total = np.take_along_axis(sums, high, 1) - np.take_along_axis(sums, low, 1)
+        inside = (number > 0) & (outer <= width + 1)
+        echo[:, columns] = np.where(inside, total / np.maximum(number, 1), np.nan)
+        middle = np.clip(
+            (np.hypot(x, altitude_m[:, None]) / sample_m).astype(np.int32), 0, width - 1
+        )
+        label = np.take_along_axis(levels.label, middle, 1)
+        shadow[:, columns] = inside & (label == SHADOW)
+        seen[:, columns] = inside | ((label != NO_DATA) & (outer <= width + 1))
+    return echo, shadow, seen
+
+
+def _add_object(
+    elevation: FloatArray,
+    sigma: FloatArray,
+    row: ObjectRow,
+    across: FloatArray,
+    along_m: FloatArray,
+) -> None:
+    """Add one object's fitted shape to the lines' contours, in place."""
+    beta = row.shape if np.isfinite(row.shape) else 1.0
+    tenth = np.sqrt((2 * np.log(10.0)) ** (1 / beta))
+    sx, sy = max(row.half_across_m / tenth, 1e-3), max(row.half_along_m / tenth, 1e-3)
+    lines = np.flatnonzero(np.abs(along_m - row.along_m) < 2.5 * row.half_along_m)
+    columns = np.flatnonzero(np.abs(across - row.across_m) < 2.5 * row.half_across_m)
+    if len(lines) == 0 or len(columns) == 0:
+        return
+    box = np.ix_(lines, columns)
+    q = ((along_m[lines] - row.along_m) / sy)[:, None] ** 2 + (
+        (across[columns] - row.across_m) / sx
+    ) ** 2
+    profile = np.exp(-0.5 * np.minimum(q**beta, 60.0))
+    sign = 1.0 if row.kind == "hill" else -1.0
+    elevation[box] += sign * row.height_m * profile
+    # Height's own sigma scales with the profile; on its flanks the place and shape count, a quarter of the height.
+    flank = 0.5 * row.height_m * 2 * np.sqrt(profile * (1 - profile)) * 0.5
+    sigma[box] = np.sqrt(sigma[box] ** 2 + (row.sigma_m * profile) ** 2 + flank**2)
