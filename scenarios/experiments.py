@@ -29,6 +29,9 @@ logger = logging.getLogger(__name__)
 
 # Enough tasks under way to keep every worker busy, few enough to keep memory flat.
 _TASKS_PER_WORKER = 4
+# A Dask task costs milliseconds, so short runs share one: as many as take about this long together.
+_BATCH_SECONDS = 0.2
+_LARGEST_BATCH = 32
 
 
 class SchedulerLostError(BathynavError):
@@ -143,27 +146,33 @@ def _through(
 
     workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
     pending = as_completed(loop=client.loop)
-    waiting: dict[str, RunSpec] = {}
+    waiting: dict[str, list[RunSpec]] = {}
+    batch = 1
 
-    def submit(spec: RunSpec) -> None:
-        future: Future[Any] = client.submit(
-            execute, _request(plan, spec, out), key=f"run-{spec.key}", pure=True, retries=2
-        )
-        waiting[future.key] = spec  # type: ignore[attr-defined]
-        pending.add(future)
+    def submit() -> None:
+        chosen = list(itertools.islice(specs, batch))
+        if chosen:
+            requests = [_request(plan, spec, out) for spec in chosen]
+            future: Future[Any] = client.submit(
+                execute, requests, key=f"run-{chosen[0].key}", pure=True, retries=2
+            )
+            waiting[future.key] = chosen  # type: ignore[attr-defined]
+            pending.add(future)
 
-    for spec in itertools.islice(specs, workers * _TASKS_PER_WORKER):
-        submit(spec)
+    for _ in range(workers * _TASKS_PER_WORKER):
+        submit()
     for future in pending:
-        spec = waiting.pop(future.key)
+        chosen = waiting.pop(future.key)
         try:
-            answer = future.result()
+            answers = future.result()
         except CancelledError as error:
             raise OSError("its runs were cancelled") from error
-        yield {**_header(plan, spec), **answer}
         future.release()
-        for following in itertools.islice(specs, 1):
-            submit(following)
+        for spec, answer in zip(chosen, answers, strict=True):
+            yield {**_header(plan, spec), **answer}
+        mean_s = sum(a["seconds"] for a in answers) / len(answers)
+        batch = max(1, min(_LARGEST_BATCH, int(_BATCH_SECONDS / mean_s)))
+        submit()
 
 
 def _request(plan: SweepPlan, spec: RunSpec, out: Path) -> dict[str, Any]:
@@ -193,8 +202,12 @@ def _header(plan: SweepPlan, spec: RunSpec) -> dict[str, Any]:
 _server: RunServer | None = None
 
 
-def execute(request: dict[str, Any]) -> dict[str, Any]:
-    """Run one request in this worker's server; the function that workers call."""
+def execute(requests: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Run requests one after the other in this worker's server; the function that workers call."""
+    return [_execute_one(request) for request in requests]
+
+
+def _execute_one(request: dict[str, Any]) -> dict[str, Any]:
     global _server
     if _server is None:
         _server = RunServer(TASKS[request["task"]][2])

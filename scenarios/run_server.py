@@ -48,7 +48,8 @@ class RunServer:
                 record: dict[str, Any] = json.loads(answer)
                 return record
             self.close()
-        return {"status": "crashed", "error": "the run's server died twice", "metrics": {}}
+        error = "the run's server died twice"
+        return {"status": "crashed", "error": error, "metrics": {}, "seconds": 1.0}
 
     def close(self) -> None:
         """Stop the server and whatever it runs."""
