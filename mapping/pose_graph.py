@@ -1,0 +1,298 @@
+"""The pose graph of a survey in GTSAM: keyframe corrections from odometry, fixes and registrations.
+
+Unknown is the *correction* of the navigation at each keyframe, not the pose: headings are measured to
+a fraction of a degree, so everything is linear in the corrections and one Gauss-Newton step solves it.
+docs/pose-graph.md has the derivation.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam as typed_gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, E, G, H
+
+from mapping.keyframes import KeyframeFix, Keyframes
+from perception.records import BoolArray, FloatArray
+
+# The stubs of the wheel know neither KeyVector arguments nor overloads by noise model.
+gtsam: Any = typed_gtsam
+
+logger = logging.getLogger(__name__)
+
+# The tie between a keyframe and the ground that it saw is exact; a millimetre keeps it well-conditioned.
+_TIE_M = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class GraphConfig:
+    """How far the navigation may be wrong.
+
+    Attributes
+    ----------
+    drift_m_per_sqrt_km : random walk of the position, 1-sigma per axis after 1 km.
+    heading_bias_deg, scale : 1-sigma of each pass's course error and speed-scale error.
+    sonar_heading_deg : 1-sigma of the difference between the sonar's heading error and the course error.
+    start_m : 1-sigma of the navigation's start where no fix is given (a GPS fix before the dive).
+    start_with_fixes_m : the same where fixes are given, which then decide.
+    height_m : 1-sigma of a strip's height offset (depth sensor, tide left over).
+    outlier_probability : chance of refusing a good registration (chi-square tail of the GNC threshold).
+    """
+
+    drift_m_per_sqrt_km: float = 4.0
+    heading_bias_deg: float = 0.5
+    scale: float = 0.005
+    sonar_heading_deg: float = 0.3
+    start_m: float = 2.0
+    start_with_fixes_m: float = 1000.0
+    height_m: float = 0.3
+    outlier_probability: float = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A registration between two keyframes: the ground each saw, brought together.
+
+    Attributes
+    ----------
+    first, second : keyframes.
+    first_offset_m, second_offset_m : (2,) from each keyframe to the matched ground.
+    shift_m : (2,) correction of the ground of `second` minus that of `first`.
+    covariance_m2 : (2, 2) of `shift_m`.
+    height_m, height_sigma_m : height correction of second minus first; NaN unknown.
+    """
+
+    first: int
+    second: int
+    first_offset_m: FloatArray
+    second_offset_m: FloatArray
+    shift_m: FloatArray
+    covariance_m2: FloatArray
+    height_m: float = float("nan")
+    height_sigma_m: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Corrections with covariance, and what the solver thought of its input.
+
+    Attributes
+    ----------
+    correction_m : (k, 2) to be added to the keyframes' positions; `covariance_m2` (k, 2, 2).
+    pass_errors : (p, 3) scale, course bias, sonar heading bias (rad) of each strip; `pass_sigma` alike.
+    height_m, height_sigma_m : (p,) to be added to each strip's heights.
+    link_used, fix_used : which were found consistent.
+    error_before, error_after : the graph's error (half a chi-square) over what was used.
+    indeterminate, worsened : the graph does not determine the answer; the answer is no better.
+    """
+
+    correction_m: FloatArray
+    covariance_m2: FloatArray
+    pass_errors: FloatArray
+    pass_sigma: FloatArray
+    height_m: FloatArray
+    height_sigma_m: FloatArray
+    link_used: BoolArray
+    fix_used: BoolArray
+    error_before: float
+    error_after: float
+    indeterminate: bool
+    worsened: bool
+
+
+def perpendicular(vector: FloatArray) -> FloatArray:
+    """Return the change of (east, north) vectors (..., 2) per radian of clockwise turn."""
+    return np.stack([vector[..., 1], -vector[..., 0]], axis=-1)
+
+
+def solve(
+    keyframes: Keyframes,
+    links: Sequence[Link] = (),
+    fixes: Sequence[KeyframeFix] = (),
+    config: GraphConfig | None = None,
+    robust: bool = True,
+) -> Solution:
+    """Solve the survey's graph; wrong registrations and fixes are found by graduated non-convexity.
+
+    Parameters
+    ----------
+    robust : False takes every registration and fix at its word.
+    """
+    config = config or GraphConfig()
+    graph, values, doubtful = _build(keyframes, links, fixes, config)
+    used = np.ones(len(doubtful), bool)
+    if robust and doubtful:
+        used = _consistent(graph, values, doubtful, config)
+    kept = _without(graph, [f for f, ok in zip(doubtful, used, strict=True) if not ok])
+    result = gtsam.GaussNewtonOptimizer(kept, values, gtsam.GaussNewtonParams()).optimize()
+    before, after = kept.error(values), kept.error(result)
+    marginals, indeterminate = _marginals(kept, result)
+    n_links = len(links)
+    heights = np.array([np.isfinite(link.height_m) for link in links], bool)
+    logger.info(
+        "pose graph: %d keyframes, %d of %d registrations used, error %.1f -> %.1f",
+        len(keyframes),
+        int(used[:n_links].sum()),
+        n_links,
+        before,
+        after,
+    )
+    passes = len(keyframes.starts) - 1
+
+    def covariance(key: int, size: int) -> FloatArray:
+        if marginals is None:
+            return np.full((size, size), np.nan)
+        return np.asarray(marginals.marginalCovariance(key))
+
+    strip_cov = [covariance(B(p), 3) for p in range(passes)]
+    return Solution(
+        correction_m=np.array([result.atVector(E(k)) for k in range(len(keyframes))]),
+        covariance_m2=np.array([covariance(E(k), 2) for k in range(len(keyframes))]),
+        pass_errors=np.array([result.atVector(B(p)) for p in range(passes)]),
+        pass_sigma=np.sqrt(np.array([np.diag(c) for c in strip_cov])),
+        height_m=np.array([result.atVector(H(p))[0] for p in range(passes)]),
+        height_sigma_m=np.sqrt(np.array([covariance(H(p), 1)[0, 0] for p in range(passes)])),
+        link_used=used[:n_links],
+        fix_used=used[n_links + int(heights.sum()) :],
+        error_before=before,
+        error_after=after,
+        indeterminate=indeterminate,
+        worsened=bool(after > before * (1 + 1e-9) + 1e-9),
+    )
+
+
+def _build(
+    keyframes: Keyframes,
+    links: Sequence[Link],
+    fixes: Sequence[KeyframeFix],
+    config: GraphConfig,
+) -> tuple[Any, Any, list[int]]:
+    """Return the graph, its start (no correction) and the indices of factors that may be wrong."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    _add_passes(graph, values, keyframes, config)
+    _add_odometry(graph, values, keyframes, config, absolute=bool(fixes))
+    doubtful: list[int] = []
+    for number, link in enumerate(links):
+        doubtful.append(_add_link(graph, values, keyframes, link, number))
+    for link in links:
+        if np.isfinite(link.height_m):
+            doubtful.append(graph.size())
+            a, b = (int(keyframes.strip[k]) for k in (link.first, link.second))
+            noise = gtsam.noiseModel.Isotropic.Sigma(1, link.height_sigma_m)
+            graph.add(gtsam.BetweenFactorVector(H(a), H(b), np.array([link.height_m]), noise))
+    for fix in fixes:
+        doubtful.append(graph.size())
+        noise = gtsam.noiseModel.Gaussian.Covariance(fix.covariance_m2)
+        graph.add(gtsam.PriorFactorVector(E(fix.keyframe), fix.correction_m, noise))
+    return graph, values, doubtful
+
+
+def _add_passes(graph: Any, values: Any, keyframes: Keyframes, config: GraphConfig) -> None:
+    """Add each pass's scale, course bias, sonar heading bias and height offset with their priors."""
+    bias, sonar = np.radians(config.heading_bias_deg), np.radians(config.sonar_heading_deg)
+    covariance = np.diag([config.scale**2, bias**2, bias**2 + sonar**2])
+    # One compass steers the dead reckoning and points the sonar: their errors are mostly one.
+    covariance[1, 2] = covariance[2, 1] = bias**2
+    errors = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    height = gtsam.noiseModel.Isotropic.Sigma(1, config.height_m)
+    for p in range(len(keyframes.starts) - 1):
+        values.insert(B(p), np.zeros(3))
+        values.insert(H(p), np.zeros(1))
+        graph.add(gtsam.PriorFactorVector(B(p), np.zeros(3), errors))
+        graph.add(gtsam.PriorFactorVector(H(p), np.zeros(1), height))
+
+
+def _add_odometry(
+    graph: Any, values: Any, keyframes: Keyframes, config: GraphConfig, absolute: bool
+) -> None:
+    """Add corrections and the way between them: a random walk plus the pass's scale and course error.
+
+    e[k] - e[k-1] = scale * d + bias * perpendicular(d) + walk, with d the navigation's step.
+    """
+    position = np.column_stack([keyframes.easting_m, keyframes.northing_m])
+    start_m = config.start_with_fixes_m if absolute else config.start_m
+    start = gtsam.noiseModel.Isotropic.Sigma(2, start_m)
+    for k in range(len(keyframes)):
+        values.insert(E(k), np.zeros(2))
+        way = keyframes.way_m[k]
+        if not np.isfinite(way):
+            graph.add(gtsam.PriorFactorVector(E(k), np.zeros(2), start))
+            continue
+        step = position[k] - position[k - 1]
+        walk = np.hypot(config.drift_m_per_sqrt_km * np.sqrt(way / 1000.0), keyframes.jump_m[k])
+        effect = np.column_stack([step, perpendicular(step), np.zeros(2)])
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, max(walk, 1e-3))
+        graph.add(
+            _linear(
+                (E(k - 1), -np.eye(2)),
+                (E(k), np.eye(2)),
+                (B(int(keyframes.strip[k - 1])), -effect),
+                noise,
+            )
+        )
+
+
+def _add_link(graph: Any, values: Any, keyframes: Keyframes, link: Link, number: int) -> int:
+    """Add the two patches of ground and the registration between them; return its factor's index."""
+    tie = gtsam.noiseModel.Isotropic.Sigma(2, _TIE_M)
+    ends = ((link.first, link.first_offset_m), (link.second, link.second_offset_m))
+    for side, (k, offset) in enumerate(ends):
+        ground = G(2 * number + side)
+        values.insert(ground, np.zeros(2))
+        # A wrong heading of the sonar swings the ground about the vehicle.
+        swing = np.column_stack([np.zeros((2, 2)), perpendicular(offset)])
+        graph.add(
+            _linear(
+                (E(k), -np.eye(2)), (ground, np.eye(2)), (B(int(keyframes.strip[k])), -swing), tie
+            )
+        )
+    noise = gtsam.noiseModel.Gaussian.Covariance(link.covariance_m2)
+    graph.add(gtsam.BetweenFactorVector(G(2 * number), G(2 * number + 1), link.shift_m, noise))
+    return int(graph.size()) - 1
+
+
+def _linear(*terms: Any) -> Any:
+    """Return the native factor ``sum A_i x_i = 0`` of (key, matrix) terms and a noise model."""
+    *blocks, noise = terms
+    flat = [part for block in blocks for part in block]
+    # Without a linearisation point GTSAM reads a linear factor as one in increments, not in values.
+    at = gtsam.Values()
+    for key, matrix in blocks:
+        at.insert(key, np.zeros(matrix.shape[1]))
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*flat, np.zeros(2), noise), at)
+
+
+def _consistent(graph: Any, values: Any, doubtful: list[int], config: GraphConfig) -> BoolArray:
+    """Return which doubtful factors agree with the rest (truncated least squares by GNC)."""
+    parameters = gtsam.GncGaussNewtonParams()
+    # Odometry and ties are linear factors of one noise each, which GNC then leaves alone.
+    parameters.setAllowNonNoiseModelFactors(True)
+    doubted = set(doubtful)
+    parameters.setKnownInliers([f for f in range(graph.size()) if f not in doubted])
+    optimizer = gtsam.GncGaussNewtonOptimizer(graph, values, parameters)
+    optimizer.setInlierCostThresholdsAtProbability(1.0 - config.outlier_probability)
+    optimizer.optimize()
+    weights = np.asarray(optimizer.getWeights())
+    return np.asarray(weights[doubtful] > 0.5)
+
+
+def _without(graph: Any, dropped: Sequence[int]) -> Any:
+    kept, gone = gtsam.NonlinearFactorGraph(), set(dropped)
+    for index in range(graph.size()):
+        if index not in gone:
+            kept.add(graph.at(index))
+    return kept
+
+
+def _marginals(graph: Any, values: Any) -> tuple[Any, bool]:
+    """Return the marginals, or None where the graph does not determine every unknown."""
+    try:
+        return gtsam.Marginals(graph, values), False
+    except RuntimeError as error:
+        # GTSAM's optimizers return quietly on such a graph; its marginals say so.
+        logger.warning("the pose graph is indeterminate: %s", str(error).strip().splitlines()[0])
+        return None, True
