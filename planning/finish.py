@@ -105,7 +105,7 @@ def prove(surface: Surface, easting_m: FloatArray, northing_m: FloatArray) -> Wa
     lower = lower + _PROOF_M
     weight = bilinear(surface.stack[..., WEIGHT], row, col)
     bend = surface.terms.altitude_per_m / float(weight.mean())
-    z = lower.copy()
+    z: FloatArray = lower.copy()
     for _ in range(_LIFTS):
         z = _profile(surface, s, lower, upper, bend)
         margin = polyline_extremes(least_height, row, col, z)

@@ -10,11 +10,14 @@ import numpy as np
 
 from perception.records import BoolArray, FloatArray, Grid, InputError, Progress, silent
 from planning.bound import lower_bound
+from planning.corridor import make_corridor
 from planning.cost import CostTerms
+from planning.curve import waypoints
 from planning.field import search
 from planning.finish import exact_cost, finish
+from planning.layers import cost_to_go, layered_path, thinned
 from planning.limits import VehicleLimits
-from planning.polish import Candidate, control_spacing, polish, smooth_guide
+from planning.polish import RADIUS_RESERVE, Candidate, control_spacing, polish, smooth_guide
 from planning.risk import clearance_factor, clearance_sigma, patches_crossed
 from planning.route import Route, route_of
 from planning.surface import Surface, build_surface
@@ -29,18 +32,21 @@ class PlanConfig:
     Attributes
     ----------
     planner : OMPL's planner: rrtstar, informed, sorrt, bitstar, fmt, or none.
-    iterations : of OMPL; on iterations, not on time, so that runs repeat.
+    iterations : of OMPL; on iterations, not on time, so that runs repeat; None about a second's.
     seed : of OMPL.
     risk : probability that the floor is broken anywhere along the route.
     correlation_m : distance over which the map's errors are independent; NaN 10 cells.
+    neighbours : of the grid search.
+    layers : whether the second guide (place and altitude) is asked.
     """
 
     planner: str = "bitstar"
-    iterations: int = 400
+    iterations: int | None = None
     seed: int = 0
     risk: float = 0.01
     correlation_m: float = float("nan")
     neighbours: int = 32
+    layers: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +173,19 @@ def _plan_on(
     guide = np.concatenate([ends[:1], guide[1:-1], ends[1:]])
     candidates = [_polished(surface, guide, "grid")]
     lap("polish_s")
+    if config.layers and not _good_enough(candidates, grid_cost):
+        layered = layered_path(surface, tuple(ends[0]), tuple(ends[1]))
+        lap("layers_s")
+        if len(layered.points) > 2:
+            candidates.append(_polished(surface, layered.points, "layers"))
+        lap("polish_s")
+    if config.planner != "none":
+        seed = min(candidates, key=_merit)
+        found = _ompl(surface, seed, ends, config)
+        lap("ompl_s")
+        if found is not None:
+            candidates.append(_polished(surface, found, "ompl"))
+        lap("polish_s")
     costs = {c.source: c.cost for c in candidates}
     route, problem, where = _best_proved(surface, candidates, grid.crs)
     lap("proof_s")
@@ -175,9 +194,36 @@ def _plan_on(
     )  # fmt: skip
 
 
+# A route within this share of the limit-free grid search leaves the second guide nothing to find.
+_GOOD = 1.004
+
+
+def _good_enough(candidates: list[Candidate], grid_cost: float) -> bool:
+    return any(c.breach == 0 and c.cost < _GOOD * grid_cost for c in candidates)
+
+
+def _merit(candidate: Candidate) -> tuple[bool, float]:
+    return candidate.breach > 0, candidate.cost
+
+
 def _polished(surface: Surface, guide: FloatArray, source: str) -> Candidate:
     length = float(np.hypot(*np.diff(guide, axis=0).T).sum())
     return polish(surface, smooth_guide(guide, control_spacing(surface, length)), source=source)
+
+
+def _ompl(
+    surface: Surface, seed: Candidate, ends: FloatArray, config: PlanConfig
+) -> FloatArray | None:
+    """Return the path that OMPL finds in the corridor around the best candidate so far."""
+    from planning.ompl_planner import plan_in_corridor
+
+    thin = thinned(surface)
+    to_go = cost_to_go(thin, thin.node((ends[1, 0], ends[1, 1])))
+    radius = surface.limits.turn_radius_m * RADIUS_RESERVE
+    guide = waypoints(seed.points, radius, 2.0 * min(surface.cell_m))
+    corridor = make_corridor(surface, guide, to_go, thin.cell_m, thin.shift_m)
+    found = plan_in_corridor(corridor, config.planner, config.seed, config.iterations)
+    return None if found is None else corridor.polyline(found.states)
 
 
 def _best_proved(
@@ -185,7 +231,7 @@ def _best_proved(
 ) -> tuple[Route | None, str, tuple[float, float] | None]:
     """Return the cheapest candidate that passes the proof, or what broke the best of them."""
     problem, where = "", None
-    for candidate in sorted(candidates, key=lambda c: c.cost):
+    for candidate in sorted(candidates, key=_merit):
         w = finish(surface, candidate.points)
         if not w.problem:
             return route_of(w, exact_cost(surface, w), crs), "", None

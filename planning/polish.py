@@ -154,9 +154,9 @@ def _whole_cost(stack, width, height, points, radius, step, rules, px, py, work,
 
 
 @njit(cache=True)
-def _window_cost(
+def _window_cost(  # type: ignore[no-untyped-def]
     stack, width, height, points, first, last, radius, step, rules, px, py, work, hull
-):  # type: ignore[no-untyped-def]
+):
     n, overlap = sample_curve(points, first, last, radius, step, px, py)
     if n < 0:
         return np.inf
