@@ -29,6 +29,7 @@ class PassConfig:
     gap_m: float = 20.0
     turn_radius_ranges: float = 1.3
     turn_rad: float = np.radians(35.0)
+    straight_rad: float = np.radians(8.0)
     most_turn_rad: float = np.radians(150.0)
     stop_share: float = 0.15
     stop_m_s: float = 0.05
@@ -149,13 +150,20 @@ def _turns(track: Track, gaps: IntArray, usual_m_s: float, config: PassConfig) -
     base_s = base_m / usual_m_s
     limit_rad = base_m / (config.turn_radius_ranges * range_m)
     for a, b in _runs(len(turning), gaps):
-        heading = smooth_heading(track.time_s[a:b], track.heading_rad[a:b], base_s / 2)
+        heading = smooth_heading(track.time_s[a:b], track.heading_rad[a:b], base_s / 4)
         time_s = track.time_s[a:b] + 1e-6 * np.arange(b - a)
         ahead = np.interp(time_s + base_s / 2, time_s, heading)
         behind = np.interp(time_s - base_s / 2, time_s, heading)
         for first, last in _true_runs(abs(ahead - behind) > limit_rad):
-            if abs(ahead[last - 1] - behind[first]) >= config.turn_rad:
-                turning[a + first : a + last] = True
+            before, after = behind[first], ahead[last - 1]
+            if abs(after - before) < config.turn_rad:
+                continue
+            # The window that found the turn is wider than a tight one: keep the straight ends.
+            bent = abs(heading[first:last] - before) > config.straight_rad
+            still = abs(heading[first:last] - after) > config.straight_rad
+            inner = np.flatnonzero(bent & still)
+            if len(inner):
+                turning[a + first + inner[0] : a + first + inner[-1] + 1] = True
     return turning
 
 

@@ -118,7 +118,7 @@ class Survey:
             defects += [prefix + text for text in found]
         table = _joined(tables)
         if installation is not None:
-            table = installation.apply(table)
+            table = installation.apply(table, all(raw.utc for raw in files))
         _refuse_unusable(files, table)
         if not np.isfinite(table.depth_m).any():
             warnings.append(
