@@ -1,0 +1,165 @@
+"""Integrity: is the filter still where it says, and how far off may it be.
+
+Health is judged on normalised innovations over two windows: a short one that sees a filter fall off
+(most soundings outside the gate), and a long one that sees a filter sit in a wrong place which fits
+half well (innovations larger than claimed, or not white: over wrong ground the misfit of one ping
+repeats in the next, which noise never does).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.kalman import Fit
+from localization.likelihood import GATE
+from localization.measurements import Soundings
+from localization.terrain import TerrainMap
+from perception.records import FloatArray
+
+# Risk that the error exceeds the protection level, for each update.
+RISK = 1e-5
+# Updates in the short and the long window.
+_SHORT, _LONG = 12, 60
+# With one beam in ten wild, 35 % outside the gate in 48 soundings has a chance below 1e-6.
+_WILD_SHARE = 0.35
+# Mean square of normalised innovations inside the gate: 1 if claimed right; 240 of them scatter by
+# 0.09, and a model that is a quarter off in sigma gives 1.6.
+_LARGE = 2.0
+# Lag-one autocorrelation of white innovations scatters by 0.065 over 240 soundings.
+_COLOURED, _COLOURED_AND_LARGE = 0.35, 1.35
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether the filter is healthy, and if not why."""
+
+    healthy: bool
+    reason: str = ""
+
+
+class HealthMonitor:
+    """Windows of normalised innovations; `add` each update's fit, then ask `verdict`."""
+
+    def __init__(self) -> None:
+        self.normalised: deque[FloatArray] = deque(maxlen=_LONG)
+
+    def reset(self) -> None:
+        """Forget the past: a new search begins."""
+        self.normalised.clear()
+
+    @property
+    def updates(self) -> int:
+        """Number of updates with soundings in the window."""
+        return len(self.normalised)
+
+    def add(self, fit: Fit, beam: FloatArray, beams: int) -> None:
+        """Take one update's fit; `beam` (n,) tells which beam each residual belongs to."""
+        row = np.full(beams, np.nan)
+        if len(fit.normalised) == len(beam):
+            row[beam] = fit.normalised
+        elif len(fit.normalised):
+            row[: len(fit.normalised)] = fit.normalised
+        self.normalised.append(row)
+
+    def verdict(self) -> Verdict:
+        """Judge the windows."""
+        if len(self.normalised) < _SHORT // 2:
+            return Verdict(True)
+        rows = np.array(self.normalised)
+        recent = rows[-_SHORT:]
+        recent = recent[np.isfinite(recent)]
+        if recent.size >= 6:
+            wild = float(np.mean(np.abs(recent) > 4.0))
+            if wild > _WILD_SHARE:
+                return Verdict(False, f"{wild:.0%} of recent soundings do not fit the map")
+        inside = np.where(np.abs(rows) < 4.0, rows, np.nan)
+        count = int(np.isfinite(inside).sum())
+        if count < 60:
+            return Verdict(True)
+        size = float(np.nanmean(inside**2))
+        pair = inside[1:] * inside[:-1]
+        colour = float(np.nanmean(pair) / size) if np.isfinite(pair).sum() > 40 else 0.0
+        if size > _LARGE:
+            return Verdict(False, f"innovations are {math.sqrt(size):.2f} times their claimed size")
+        if size > _COLOURED_AND_LARGE and colour > _COLOURED:
+            return Verdict(
+                False, f"innovations repeat (autocorrelation {colour:.2f}) as over wrong ground"
+            )
+        return Verdict(True)
+
+
+class FreeGround:
+    """The rival of every match: the soundings are of ground that the map does not show.
+
+    Each beam's soundings are predicted from that beam's own past, a random walk whose steps have the
+    map's own roughness (`TerrainMap.structure_m2`) over the way its footprint moved. A match is
+    proved when the map predicts soundings better than this by a factor that chance does not give,
+    and refuted when it does worse. It measures what a count of updates cannot: over smooth ground a
+    short track fits in many places, and on a wrong map in some.
+    """
+
+    def __init__(self, terrain: TerrainMap, beams: int) -> None:
+        self.terrain = terrain
+        self.level_m = np.full(beams, np.nan)
+        self.variance_m2 = np.zeros(beams)
+        self.place_m = np.full((2, beams), np.nan)
+
+    def update(self, soundings: Soundings, easting_m: float, northing_m: float) -> float:
+        """Return the log likelihood of an update's soundings and learn them; NaN at the first."""
+        beam = soundings.beam
+        place = np.stack([easting_m + soundings.east_m, northing_m + soundings.north_m])
+        moved = np.hypot(*(place - self.place_m[:, beam]))
+        known = np.isfinite(moved)
+        noise = (soundings.range_sigma_m * soundings.down) ** 2
+        walk = self.terrain.structure_m2(np.where(known, moved, 1.0))
+        predicted = self.variance_m2[beam] + walk
+        spread = predicted + noise
+        innovation = soundings.elevation_m - self.level_m[beam]
+        square = innovation**2 / spread
+        inside = known & (square < GATE**2)
+        gain = np.where(inside, predicted / spread, 0.0)
+        # A new beam, or one that jumped, starts at what it reads.
+        self.level_m[beam] = np.where(
+            inside, self.level_m[beam] + gain * np.where(known, innovation, 0.0),
+            np.where(known, self.level_m[beam], soundings.elevation_m),
+        )  # fmt: skip
+        self.variance_m2[beam] = np.where(
+            inside, (1 - gain) * predicted, np.where(known, predicted, noise)
+        )
+        self.place_m[:, beam] = place
+        if not known.all():
+            return math.nan
+        return float(-0.5 * np.sum(np.minimum(square, GATE**2) + np.log(spread)))
+
+
+def protection_level(covariance: FloatArray, risk: float = RISK) -> float:
+    """Radius that a two-dimensional Gaussian error exceeds with the stated risk at most.
+
+    The largest axis of the ellipse is taken for both (Rayleigh: ``sqrt(-2 ln risk)`` sigmas).
+
+    >>> round(protection_level(np.eye(2)), 2)
+    4.8
+    """
+    largest = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    return math.sqrt(max(largest, 0.0)) * math.sqrt(-2.0 * math.log(risk))
+
+
+def with_doubt(
+    mean: FloatArray,
+    covariance: FloatArray,
+    other_mean: FloatArray,
+    other_covariance: FloatArray,
+    doubt: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Mix a Gaussian with another that holds with probability `doubt`; the mean stays.
+
+    Used until a match is proved: the place found may be the wrong one of several, and then dead
+    reckoning is all there is.
+    """
+    apart = other_mean - mean
+    mixed = (1 - doubt) * covariance + doubt * (other_covariance + np.outer(apart, apart))
+    return mean, mixed

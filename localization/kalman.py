@@ -1,0 +1,317 @@
+"""Kalman tracking after convergence: a bank of filterpy filters that differ in what is not known.
+
+State: offset of the true position from dead reckoning (east, north), heading bias, scale, depth bias,
+and for each beam the map's error under it, a Gauss-Markov process over the way travelled. Carrying
+the map's error as state is what keeps the covariance honest when the error is correlated: the
+filter knows that the next sounding shares it.
+
+Two things no file tells: the correlation length of the map's error, and how far dead reckoning
+wanders at random. The bank holds one filter for each of a few values and weighs them by the
+likelihood of their innovations (multiple-model adaptive estimation, Magill 1965); the estimate is
+the mixture.
+
+The terrain is linearised statistically (`terrain.linearise`), over the filter's own uncertainty.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+
+from localization.likelihood import DEFAULT_LENGTH_M, GATE
+from localization.measurements import Soundings
+from localization.terrain import TerrainMap, linearise
+from perception.records import BoolArray, FloatArray
+
+EAST, NORTH, TURN, SCALE, DEPTH = range(5)
+# Random walks of dead reckoning to choose among, m per square root of an hour, and their prior
+# weights: from a DVL-aided inertial system to one that slips or drifts with unmeasured currents.
+_WALKS_M_SQRT_H = {0.5: 0.3, 2.0: 0.3, 7.0: 0.25, 25.0: 0.15}
+# Correlation lengths to choose among beside the split that the map's spectrum suggests.
+_LENGTHS_M = (30.0, 150.0)
+_USUAL_WALK_M_SQRT_H = 2.0
+# Ranges may be noisier than stated: half the bank's members for it, at this factor.
+_NOISIER = 2.0
+# More beams than this and the map's error is inflated instead of carried for each.
+_MOST_BEAMS = 8
+# A residual this many sigmas out is not used: with Gaussian noise one in 16,000.
+_GATE = 4.0
+# Evidence is forgotten over some hundred updates, so that a change can be followed.
+_MEMORY = 0.995
+# Heading bias and scale wander a little: degrees per square root of an hour, and a part of 1.
+_TURN_WALK_RAD_SQRT_H = np.radians(0.02)
+_SCALE_WALK_SQRT_H = 2e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How an update's soundings fitted the prediction.
+
+    Attributes
+    ----------
+    normalised : (n,) residual over its predicted sigma, every sounding that met the map.
+    used : (n,) inside the gate.
+    common_step_m : shift of all soundings together that would make them fit, 0 if there is none.
+    log_likelihood : of the soundings used.
+    """
+
+    normalised: FloatArray
+    used: BoolArray
+    common_step_m: float
+    log_likelihood: float
+
+
+NO_FIT = Fit(np.zeros(0), np.zeros(0, bool), 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """What one filter of the bank assumes."""
+
+    walk_m2_s: float
+    shared_m: float
+    length_m: float
+    white_m2: float
+    noise_factor: float
+    weight: float
+
+
+def hypotheses(terrain: TerrainMap, walk_m_sqrt_h: float | None) -> list[Hypothesis]:
+    """List the assumptions of the bank for a map and, where it is known, a random walk."""
+    error = terrain.error
+    between = error.between_m**2
+    if error.correlated_m > error.filtered_m:
+        length = error.length_m if np.isfinite(error.length_m) else DEFAULT_LENGTH_M
+        split = (float(np.hypot(error.filtered_m, error.correlated_m)), length, between)
+    else:
+        split = (error.filtered_m, error.filtered_length_m, between + error.correlated_m**2)
+    walks = _WALKS_M_SQRT_H if walk_m_sqrt_h is None else {walk_m_sqrt_h: 1.0}
+    usual = _USUAL_WALK_M_SQRT_H if walk_m_sqrt_h is None else walk_m_sqrt_h
+    members = [(walk, *split, 1.0, 0.6 * prior) for walk, prior in walks.items()]
+    members += [(walk, *split, _NOISIER, 0.1 * prior) for walk, prior in walks.items()]
+    if not np.isfinite(error.length_m):
+        members += [(usual, error.stated_m, reach, between, 1.0, 0.15) for reach in _LENGTHS_M]
+    return [
+        Hypothesis(walk**2 / 3600.0, shared, reach, white, noise, weight)
+        for walk, shared, reach, white, noise, weight in members
+    ]
+
+
+class TerrainKalman:
+    """One filterpy extended Kalman filter under one hypothesis."""
+
+    def __init__(
+        self,
+        terrain: TerrainMap,
+        hypothesis: Hypothesis,
+        mean: FloatArray,
+        covariance: FloatArray,
+        beams: int,
+    ) -> None:
+        self.terrain = terrain
+        self.assumed = hypothesis
+        self.beams = beams if beams <= _MOST_BEAMS else 0
+        size = 5 + self.beams
+        self.filter = ExtendedKalmanFilter(dim_x=size, dim_z=1)
+        self.filter.x = np.concatenate([mean, np.zeros(self.beams)])
+        self.filter.P = np.zeros((size, size))
+        self.filter.P[:5, :5] = covariance
+        self.filter.P[5:, 5:] = hypothesis.shared_m**2 * np.eye(self.beams)
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean (5,) of east, north, turn, scale and depth bias."""
+        x: FloatArray = self.filter.x[:5]
+        return x
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (5, 5) of the same."""
+        p: FloatArray = self.filter.P[:5, :5]
+        return p
+
+    def predict(self, step_e: float, step_n: float, seconds: float, tide_m2: float) -> None:
+        """Carry the state over a dead-reckoned step."""
+        size = 5 + self.beams
+        way = float(np.hypot(step_e, step_n))
+        keep = np.exp(-way / self.assumed.length_m)
+        f = np.eye(size)
+        f[EAST, SCALE], f[EAST, TURN] = step_e, step_n
+        f[NORTH, SCALE], f[NORTH, TURN] = step_n, -step_e
+        f[5:, 5:] *= keep
+        q = np.zeros((size, size))
+        q[EAST, EAST] = q[NORTH, NORTH] = self.assumed.walk_m2_s * seconds
+        q[TURN, TURN] = _TURN_WALK_RAD_SQRT_H**2 * seconds / 3600.0
+        q[SCALE, SCALE] = _SCALE_WALK_SQRT_H**2 * seconds / 3600.0
+        q[DEPTH, DEPTH] = tide_m2
+        q[5:, 5:] = (1 - keep**2) * self.assumed.shared_m**2 * np.eye(self.beams)
+        self.filter.F, self.filter.Q = f, q
+        self.filter.predict()
+
+    def update(self, soundings: Soundings, easting_m: float, northing_m: float) -> Fit:
+        """Correct the state by an update's soundings; wild ones are left out."""
+        z, predicted, jacobian, noise = self._model(soundings, easting_m, northing_m)
+        if not len(z):
+            return NO_FIT
+        innovation = z - predicted
+        spread = jacobian @ self.filter.P @ jacobian.T + np.diag(noise)
+        normalised = innovation / np.sqrt(np.diag(spread))
+        used = np.abs(normalised) < _GATE
+        step = _common_step(innovation, np.sqrt(np.diag(spread)), used)
+        if not used.any():
+            return Fit(normalised, used, step, _cost_of_wild(np.diag(spread)))
+        z, predicted, jacobian, noise = z[used], predicted[used], jacobian[used], noise[used]
+        self.filter.update(z, lambda x: jacobian, lambda x: predicted, R=np.diag(noise))
+        log_likelihood = -0.5 * (
+            self.filter.y @ self.filter.SI @ self.filter.y + np.linalg.slogdet(self.filter.S)[1]
+        )
+        wild = _cost_of_wild(np.diag(spread)[~used])
+        return Fit(normalised, used, step, float(log_likelihood) + wild)
+
+    def loosen_depth(self, step_m: float) -> None:
+        """Let the depth bias move by a step: a sensor was reset, or ballast shifted."""
+        self.filter.P[DEPTH, :] = 0.0
+        self.filter.P[:, DEPTH] = 0.0
+        self.filter.P[DEPTH, DEPTH] = step_m**2
+
+    def _model(
+        self, s: Soundings, easting_m: float, northing_m: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Measured and predicted elevations, Jacobian and variances of the soundings on the map."""
+        x, p = self.filter.x, self.filter.P
+        spread = p[:2, :2] + 1e-9 * np.eye(2)
+        # Below half a cell the nodes would all lie on one bilinear patch, whose slope is noise.
+        least = (0.5 * self.terrain.cell_m) ** 2
+        root = np.linalg.cholesky(spread + least * np.eye(2))
+        east = s.east_m + x[TURN] * s.north_m
+        north = s.north_m - x[TURN] * s.east_m
+        plane = linearise(
+            self.terrain.height_m, self.terrain.frame, easting_m + x[EAST] + east,
+            northing_m + x[NORTH] + north, root,
+        )  # fmt: skip
+        on_map = np.isfinite(plane[:, 0])
+        height, slope_e, slope_n, left = plane[on_map].T
+        beam = s.beam[on_map]
+        jacobian = np.zeros((len(height), len(x)))
+        jacobian[:, EAST], jacobian[:, NORTH] = slope_e, slope_n
+        jacobian[:, TURN] = slope_e * north[on_map] - slope_n * east[on_map]
+        jacobian[:, DEPTH] = 1.0
+        predicted = height + x[DEPTH]
+        noise = (
+            self.assumed.noise_factor
+            * s.range_sigma_m
+            * (s.down + _padded(on_map, slope_e) * s.out_east + _padded(on_map, slope_n) * s.out_north)
+        )[on_map] ** 2 + self.assumed.white_m2 + left  # fmt: skip
+        if self.beams:
+            jacobian[np.arange(len(height)), 5 + beam] = 1.0
+            predicted = predicted + x[5 + beam]
+        else:
+            # Too many beams to carry: all that share a place count as one.
+            noise = noise + self.assumed.shared_m**2 * max(len(height), 1)
+        return s.elevation_m[on_map], predicted, jacobian, noise
+
+
+def _cost_of_wild(variance: FloatArray) -> float:
+    """Log likelihood of soundings outside the gate, whatever they read; see `likelihood`."""
+    return float(-0.5 * np.sum(GATE**2 + np.log(variance)))
+
+
+def _padded(mask: BoolArray, values: FloatArray) -> FloatArray:
+    out = np.zeros(len(mask))
+    out[mask] = values
+    return out
+
+
+def _common_step(innovation: FloatArray, sigma: FloatArray, used: BoolArray) -> float:
+    """Return the shift that explains an update in which most soundings fail together, or 0."""
+    failed = ~used
+    if failed.sum() < 3 or failed.sum() < 0.75 * len(used):
+        return 0.0
+    shift = float(np.median(innovation))
+    agree = np.abs(innovation - shift) < 3.0 * sigma
+    return shift if agree.sum() >= 3 and agree.mean() >= 0.75 else 0.0
+
+
+class KalmanBank:
+    """The bank: one estimate from several hypotheses, weighed by their evidence."""
+
+    def __init__(
+        self, terrain: TerrainMap, walk_m_sqrt_h: float | None, tide_m_sqrt_h: float, beams: int
+    ) -> None:
+        self.terrain = terrain
+        self.assumed = hypotheses(terrain, walk_m_sqrt_h)
+        self.tide_m2_s = tide_m_sqrt_h**2 / 3600.0
+        self.beams = beams
+        self.filters: list[TerrainKalman] = []
+        self.log_weight = np.zeros(0)
+
+    def start(self, mean: FloatArray, covariance: FloatArray) -> None:
+        """Begin tracking from a Gaussian of (east, north, turn, scale, depth bias)."""
+        self.filters = [
+            TerrainKalman(self.terrain, h, mean, covariance, self.beams) for h in self.assumed
+        ]
+        self.log_weight = np.log([h.weight for h in self.assumed])
+
+    def predict(self, step_e: float, step_n: float, seconds: float, slip_m2: float = 0.0) -> None:
+        """Carry every filter over a dead-reckoned step; `slip_m2` is variance beyond the walk."""
+        for f in self.filters:
+            f.predict(step_e, step_n, seconds, self.tide_m2_s * seconds)
+            f.filter.P[:2, :2] += slip_m2 * np.eye(2)
+
+    def shift(self, jump: FloatArray) -> None:
+        """Move every offset: the dead-reckoned position jumped."""
+        for f in self.filters:
+            f.filter.x[:2] += jump
+
+    def update(self, soundings: Soundings, easting_m: float, northing_m: float) -> Fit:
+        """Correct every filter; return the fit of the likeliest, with the bank's log likelihood."""
+        fits = [f.update(soundings, easting_m, northing_m) for f in self.filters]
+        best = fits[int(np.argmax(self.log_weight))]
+        if best.common_step_m:
+            for f in self.filters:
+                f.loosen_depth(best.common_step_m)
+            return best
+        prior = np.log([h.weight for h in self.assumed])
+        # Forgetting pulls towards the prior weights, never below one part in e^12.
+        weight = _MEMORY * self.log_weight + (1 - _MEMORY) * prior
+        weight -= np.logaddexp.reduce(weight)
+        weight += [fit.log_likelihood for fit in fits]
+        total = float(np.logaddexp.reduce(weight))
+        self.log_weight = np.maximum(weight - total, -12.0)
+        return replace(best, log_likelihood=total)
+
+    def fuse(self, offset_m: FloatArray, covariance_m2: FloatArray) -> bool:
+        """Correct every filter by an outside fix (2,) of the offset; False where it contradicts."""
+        mean, covariance = self.moments()
+        apart = offset_m - mean[:2]
+        if apart @ np.linalg.solve(covariance[:2, :2] + covariance_m2, apart) > _GATE**2:
+            return False
+        for f in self.filters:
+            h = np.eye(2, 5 + f.beams)
+            at = f.filter.x[:2].copy()
+            f.filter.update(offset_m, lambda x, h=h: h, lambda x, at=at: at, R=covariance_m2)
+        return True
+
+    def walk_m2_s(self) -> float:
+        """Return the random walk's variance per second, averaged over the bank."""
+        return float(self._weights() @ [h.walk_m2_s for h in self.assumed])
+
+    def _weights(self) -> FloatArray:
+        weight = np.exp(self.log_weight - self.log_weight.max())
+        share: FloatArray = weight / weight.sum()
+        return share
+
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (5,) and covariance (5, 5) of the mixture."""
+        weight = self._weights()
+        means = np.array([f.mean for f in self.filters])
+        mean = weight @ means
+        apart = means - mean
+        covariance = np.einsum("k,kij->ij", weight, [f.covariance for f in self.filters])
+        return mean, covariance + np.einsum("k,ki,kj->ij", weight, apart, apart)
+
+    def likeliest(self) -> Hypothesis:
+        """Return the assumption with the most evidence."""
+        return self.assumed[int(np.argmax(self.log_weight))]

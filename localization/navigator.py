@@ -1,0 +1,385 @@
+"""The navigator: one measurement in, one position out, with covariance, status and protection level.
+
+    dead reckoning -> particle search -> Kalman bank, on probation -> converged
+                          ^                        |
+                          '---- lost: health failed, from the last trusted state, a wider box
+
+Positions are dead-reckoned positions plus an estimated offset, so a late or repeated row costs
+nothing: it is answered with the offset of the moment.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.integrity import FreeGround, HealthMonitor, protection_level, with_doubt
+from localization.kalman import NO_FIT, KalmanBank
+from localization.measurements import Measurement, Sensors, Soundings, beam_vectors, soundings_of
+from localization.particles import ParticleFilter
+from localization.terrain import TerrainMap
+from perception.records import FloatArray
+
+logger = logging.getLogger(__name__)
+
+# Mean (5,) and covariance (5, 5) of east, north, heading bias, scale, depth bias.
+Gaussian = tuple[FloatArray, FloatArray]
+
+CONVERGED, SEARCHING, RECKONING, LOST = "converged", "searching", "dead-reckoning", "lost"
+
+# Probability, before the match is tested, that the place found is a wrong one.
+_DOUBT = 0.05
+# Evidence is not hoarded above this, so that later failure shows soon; below minus `_REFUTED` the
+# map does worse than no map. Where ground or map tell little, the evidence is a random walk about
+# zero: the bar is low enough for chance to pass it once in e^15.
+_MOST_EVIDENCE, _REFUTED = 20.0, 15.0
+# Seconds without a sounding after which the status is dead reckoning.
+_SILENT_S = 15.0
+# A step longer than this, and faster than both speeds below, is a reset of dead reckoning.
+_LEAST_JUMP_M, _SLOW_M_S, _FASTER = 10.0, 5.0, 5.0
+# Speed error assumed while the navigation itself gives no position.
+_BLIND_M_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class NavigatorConfig:
+    """How the navigator decides.
+
+    Attributes
+    ----------
+    particles : number in the search once it narrows (four times as many while it is wide).
+    hand_over_m : largest sigma of an axis at which the Kalman bank takes over.
+    probation : updates, at least, before a match is called converged.
+    proof : log of the likelihood ratio, of map against free ground, that proves a match.
+    converged_m : largest sigma of an axis of a converged state.
+    walk_m_sqrt_h : random walk of dead reckoning assumed during the search.
+    reset_depth_m : depth bias to allow for when the filter starts again: the cause may be a step.
+    grow : factor of the box from one search to the next.
+    """
+
+    particles: int = 4000
+    hand_over_m: float = 12.0
+    probation: int = 6
+    proof: float = 6.0
+    converged_m: float = 12.0
+    walk_m_sqrt_h: float = 4.0
+    reset_depth_m: float = 10.0
+    grow: float = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Where the vehicle is, by all measurements up to this one.
+
+    `covariance_m2` (2, 2) is of easting and northing; `state` (5,) is offset east, offset north,
+    heading bias, scale, depth bias, and `state_covariance` theirs; `reason` tells what changed.
+    """
+
+    time_s: float
+    easting_m: float
+    northing_m: float
+    covariance_m2: FloatArray
+    status: str
+    protection_m: float
+    state: FloatArray
+    state_covariance: FloatArray
+    reason: str = ""
+
+
+class Navigator:
+    """Terrain-relative navigation, one measurement at a time.
+
+    Parameters
+    ----------
+    terrain : the prior map, from `terrain_map`.
+    sensors : beams and noise.
+    rng : source of the search's random draws.
+
+    Examples
+    --------
+    >>> navigator = Navigator(terrain, sensors, rng)        # doctest: +SKIP
+    >>> estimate = navigator.update(measurement)            # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        terrain: TerrainMap,
+        sensors: Sensors,
+        rng: np.random.Generator,
+        config: NavigatorConfig | None = None,
+    ) -> None:
+        self.terrain = terrain
+        self.sensors = sensors
+        self.config = config or NavigatorConfig()
+        self.vectors = beam_vectors(sensors.beams) if sensors.beams else np.zeros((0, 3))
+        self.fractions = np.array([b.fraction or sensors.beam_fraction for b in sensors.beams])
+        walk = sensors.walk_m_sqrt_h
+        self.walk_m2_s = (self.config.walk_m_sqrt_h if walk is None else walk) ** 2 / 3600.0
+        self.search = ParticleFilter(terrain, self.config.particles, rng)
+        self.bank = KalmanBank(terrain, walk, sensors.tide_m_sqrt_h, len(sensors.beams))
+        self.health = HealthMonitor()
+        self.tracking = False
+        self.rival = FreeGround(terrain, len(sensors.beams))
+        self.proved = 0
+        self.evidence = 0.0
+        self.losses = 0
+        self.converged_once = False
+        self.last: Measurement | None = None
+        self.velocity: FloatArray = np.zeros(2)
+        self.since_update_m = 0.0
+        self.heard_s = -math.inf
+        self.seen_times: set[float] = set()
+        # Dead reckoning from the last trusted state: mean (5,), covariance (5, 5).
+        self.reckoned: Gaussian = (np.zeros(5), self._start_covariance())
+        self.trusted: list[Gaussian] = []
+        self.search.start(*self.reckoned)
+
+    def _start_covariance(self) -> FloatArray:
+        s = self.sensors
+        sigma = np.array([s.start_m, s.start_m, s.heading_rad, s.scale, s.depth_bias_m])
+        return np.diag(np.maximum(sigma, 1e-6) ** 2)
+
+    # ---- one row -------------------------------------------------------------------------------
+
+    def update(self, measurement: Measurement) -> Estimate:
+        """Take one row of navigation and give the position at it."""
+        m = measurement
+        if not math.isfinite(m.time_s):
+            return self._estimate(m, "row without a time: not used")
+        late = self.last is not None and m.time_s <= self.last.time_s
+        if late and m.time_s in self.seen_times:
+            return self._estimate(m, "repeated row: not used")
+        self._remember(m.time_s)
+        if not (math.isfinite(m.easting_m) and math.isfinite(m.northing_m)):
+            return self._estimate(m, "row without a position")
+        jump = "" if late else self._advance(m)
+        soundings = soundings_of(m, self.vectors, self.fractions, self.sensors.beam_floor_m)
+        reason = self._match(m, soundings) if soundings.count else ""
+        return self._estimate(m, "; ".join(r for r in (jump, reason) if r))
+
+    def fuse(
+        self, offset_m: FloatArray, covariance_m2: FloatArray, measurement: Measurement
+    ) -> Estimate:
+        """Fuse an outside fix: (2,) its position less the dead-reckoned one at its time.
+
+        A fix that contradicts a converged state by more than four sigmas is left out.
+        """
+        if self.tracking:
+            fused = self.bank.fuse(offset_m, covariance_m2)
+            reason = "" if fused else "outside fix contradicts the track: left out"
+            return self._estimate(measurement, reason)
+        self.search.fuse(offset_m, covariance_m2)
+        return self._estimate(measurement, self._hand_over())
+
+    def wander_m2_s(self) -> tuple[float, float]:
+        """Random walk, variance per second, found of the position (an axis) and of the depth bias."""
+        walk = self.bank.walk_m2_s() if self.tracking else self.walk_m2_s
+        return walk, self.sensors.tide_m_sqrt_h**2 / 3600.0
+
+    def _remember(self, time_s: float) -> None:
+        self.seen_times.add(time_s)
+        if len(self.seen_times) > 4000:
+            self.seen_times = set(sorted(self.seen_times)[-2000:])
+
+    def _advance(self, m: Measurement) -> str:
+        """Carry everything over the dead-reckoned step to a new row."""
+        last = self.last
+        self.last = m
+        if last is None:
+            self.heard_s = m.time_s
+            return ""
+        seconds = m.time_s - last.time_s
+        step = np.array([m.easting_m - last.easting_m, m.northing_m - last.northing_m])
+        reason = ""
+        usual = float(np.hypot(*self.velocity))
+        way = float(np.hypot(*step))
+        slip_m2 = 0.0
+        if way > _LEAST_JUMP_M and way > seconds * max(_SLOW_M_S, _FASTER * usual):
+            # Dead reckoning was reset: the vehicle went on, its offset changed by the jump.
+            likely = self.velocity * seconds
+            self._shift(likely - step)
+            step, slip_m2 = likely, (_BLIND_M_S * seconds) ** 2
+            reason = f"position jumped by {way:.0f} m in {seconds:.3g} s: taken as a reset"
+        else:
+            self.velocity = step / seconds
+        self.since_update_m += float(np.hypot(*step))
+        walk_m2 = self.walk_m2_s * seconds + slip_m2
+        self.reckoned = self._reckon(self.reckoned, step, seconds, walk_m2)
+        self.trusted = [self._reckon(state, step, seconds, walk_m2) for state in self.trusted]
+        if self.tracking:
+            self.bank.predict(step[0], step[1], seconds, slip_m2)
+        else:
+            self.search.predict(step[0], step[1], walk_m2)
+        return reason
+
+    def _shift(self, jump: FloatArray) -> None:
+        """Move every offset by what the dead-reckoned position jumped against."""
+        move = np.array([jump[0], jump[1], 0.0, 0.0, 0.0])
+        self.reckoned = self.reckoned[0] + move, self.reckoned[1]
+        self.trusted = [(mean + move, covariance) for mean, covariance in self.trusted]
+        self.search.shift(jump)
+        self.bank.shift(jump)
+
+    def _reckon(
+        self,
+        state: Gaussian,
+        step: FloatArray,
+        seconds: float,
+        walk_m2: float,
+    ) -> Gaussian:
+        mean, covariance = state
+        f = np.eye(5)
+        f[0, 3], f[0, 2], f[1, 3], f[1, 2] = step[0], step[1], step[1], -step[0]
+        q = np.zeros((5, 5))
+        q[0, 0] = q[1, 1] = walk_m2
+        q[4, 4] = self.sensors.tide_m_sqrt_h**2 * seconds / 3600.0
+        return f @ mean, f @ covariance @ f.T + q
+
+    # ---- matching ------------------------------------------------------------------------------
+
+    def _match(self, m: Measurement, soundings: Soundings) -> str:
+        rival = self.rival.update(soundings, m.easting_m, m.northing_m)
+        if self.tracking:
+            return self._track(m, soundings, rival)
+        tide = self.sensors.tide_m_sqrt_h**2 / 3600.0 * 3.0
+        met = self.search.update(soundings, m.easting_m, m.northing_m, self.since_update_m, tide)
+        self.since_update_m = 0.0
+        if met > 0:
+            self.heard_s = m.time_s
+        return self._hand_over()
+
+    def _hand_over(self) -> str:
+        """Let the Kalman bank take over once the search has one narrow place left."""
+        mean, covariance = self.search.moments()
+        if _largest(covariance) > self.config.hand_over_m:
+            return ""
+        # A Gaussian has 99.8 % within 3.5 sigmas: less means that rivals live outside.
+        if self.search.share_within(mean, covariance, 3.5) < 0.98:
+            return ""
+        self.bank.start(mean, covariance)
+        self.health.reset()
+        self.tracking, self.proved, self.evidence = True, 0, 0.0
+        return "place found; on probation"
+
+    def _track(self, m: Measurement, soundings: Soundings, rival: float) -> str:
+        mean, covariance = self.bank.moments()
+        if _largest(covariance) > 2 * self.config.hand_over_m:
+            # Too wide to linearise, after a long silence: search within what is known.
+            self.tracking = False
+            self.search.start(mean, covariance)
+            return "uncertainty outgrew the Kalman bank; searching within it"
+        fit = self.bank.update(soundings, m.easting_m, m.northing_m)
+        self.since_update_m = 0.0
+        if fit is NO_FIT or not len(fit.normalised):
+            return ""
+        self.heard_s = m.time_s
+        if fit.common_step_m:
+            return f"depth stepped by {fit.common_step_m:+.1f} m; depth bias set free"
+        self.health.add(fit, soundings.beam, len(self.sensors.beams))
+        verdict = self.health.verdict()
+        if not verdict.healthy:
+            return self._lose(verdict.reason)
+        if math.isfinite(rival) and len(fit.normalised) == soundings.count:
+            gained = self.evidence + fit.log_likelihood - rival
+            self.evidence = min(gained, _MOST_EVIDENCE)
+        if self.evidence < -_REFUTED:
+            return self._lose("free ground explains the soundings better than the map")
+        self.proved += 1
+        if self._is_proved() and _largest(covariance) < self.config.converged_m:
+            return self._trust()
+        return ""
+
+    def _is_proved(self) -> bool:
+        if self.converged_once:
+            return self.evidence > 0.0
+        return self.proved >= self.config.probation and self.evidence > self.config.proof
+
+    def _trust(self) -> str:
+        """Keep the state as one to return to; older ones are surer not to be spoilt already."""
+        state = self.bank.moments()
+        if self.proved % 20 == 0:
+            self.trusted = [*self.trusted, state][-4:]
+        self.reckoned = state if self.proved > 60 else self.reckoned
+        if not self.converged_once:
+            self.losses, self.converged_once = 0, True
+            return "converged"
+        return ""
+
+    def _lose(self, reason: str) -> str:
+        """Begin again from the last trusted state with a wider box and a free depth bias."""
+        self.losses += 1
+        if self.trusted:
+            self.reckoned = self.trusted[0]
+            self.trusted = []
+        mean, covariance = self.reckoned
+        growth = self.config.grow ** (2 * min(self.losses - 1, 4))
+        box = covariance.copy()
+        box[:2, :2] = growth * (box[:2, :2] + 10.0**2 * np.eye(2))
+        box[4, :], box[:, 4] = 0.0, 0.0
+        box[4, 4] = self.config.reset_depth_m**2
+        self.tracking, self.proved, self.converged_once = False, 0, False
+        self.health.reset()
+        self.search.start(mean, box)
+        logger.info("lost: %s", reason)
+        return f"lost: {reason}; searching again within {math.sqrt(_largest2(box)):.0f} m"
+
+    # ---- what is told --------------------------------------------------------------------------
+
+    def _estimate(self, m: Measurement, reason: str = "") -> Estimate:
+        state, joint, status = self._belief(m)
+        easting, northing, blind = self._position(m)
+        covariance = joint[:2, :2] + blind**2 * np.eye(2)
+        return Estimate(
+            time_s=m.time_s,
+            easting_m=easting + float(state[0]),
+            northing_m=northing + float(state[1]),
+            covariance_m2=covariance,
+            status=status,
+            protection_m=protection_level(covariance),
+            state=state,
+            state_covariance=joint,
+            reason=reason,
+        )
+
+    def _belief(self, m: Measurement) -> tuple[FloatArray, FloatArray, str]:
+        silent = m.time_s - self.heard_s > _SILENT_S
+        if self.losses:
+            mean, covariance = self.reckoned
+            grown = covariance + 10.0**2 * np.diag([1.0, 1.0, 0, 0, 0])
+            return mean, grown, RECKONING if silent else LOST
+        if self.tracking:
+            mean, covariance = self.bank.moments()
+            proved = self._is_proved()
+            doubt = _DOUBT / (_DOUBT + (1 - _DOUBT) * math.exp(max(self.evidence, -30.0)))
+            if not self.converged_once:
+                mean, covariance = with_doubt(mean, covariance, *self.reckoned, doubt)
+            if silent:
+                return mean, covariance, RECKONING
+            sure = proved and _largest(covariance) < self.config.converged_m
+            return mean, covariance, CONVERGED if sure else SEARCHING
+        mean, covariance = self.search.moments()
+        if not self.converged_once:
+            mean, covariance = with_doubt(mean, covariance, *self.reckoned, _DOUBT)
+        return mean, covariance, RECKONING if silent else SEARCHING
+
+    def _position(self, m: Measurement) -> tuple[float, float, float]:
+        """Dead-reckoned position of a row, and what is not known of it when the row has none."""
+        if math.isfinite(m.easting_m) and math.isfinite(m.northing_m):
+            return m.easting_m, m.northing_m, 0.0
+        if self.last is None or not math.isfinite(m.time_s):
+            return math.nan, math.nan, 0.0
+        gap = max(m.time_s - self.last.time_s, 0.0)
+        ahead = self.velocity * gap
+        return self.last.easting_m + ahead[0], self.last.northing_m + ahead[1], _BLIND_M_S * gap
+
+
+def _largest2(covariance: FloatArray) -> float:
+    return float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+
+
+def _largest(covariance: FloatArray) -> float:
+    """Largest 1-sigma of the horizontal position."""
+    return math.sqrt(max(_largest2(covariance), 0.0))

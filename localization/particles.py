@@ -1,0 +1,286 @@
+"""Particle filter on offset, heading bias and scale, the depth bias marginalised in each particle.
+
+It finds the place: from 50 m an axis to a few metres, through any number of rival places. Regularised
+(Musso, Oudjane & LeGland 2001): resampled particles are drawn from a kernel density, so constant
+parameters do not collapse; with the shrinkage of Liu & West (2001) once one place is left, which
+keeps the covariance, and with a kernel of metres while several are, which keeps them apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from localization.likelihood import bias_marginal, sounding_noise
+from localization.measurements import Soundings
+from localization.terrain import TerrainMap
+from perception.records import FloatArray
+
+# A spread above this may hold rivals: no shrinkage to a common mean, which would lie between them.
+_RIVALS_M = 15.0
+# Kernel while rivals may live: the spacing of thousands of particles over 50 m an axis.
+_KERNEL_M = 1.5
+
+
+@dataclass(slots=True)
+class Cloud:
+    """Particles: offsets, heading bias, scale, depth bias' mean and variance, log weights; (n,)."""
+
+    east: FloatArray
+    north: FloatArray
+    turn: FloatArray
+    scale: FloatArray
+    bias: FloatArray
+    bias_var: FloatArray
+    log_weight: FloatArray
+
+    @property
+    def count(self) -> int:
+        return len(self.east)
+
+
+class ParticleFilter:
+    """Terrain-matching particle filter; `start`, then `predict` and `update` for every row.
+
+    Parameters
+    ----------
+    terrain : the prior map.
+    count : number of particles once the search has narrowed; it starts with `wide` of them.
+    rng : source of every random draw.
+    """
+
+    def __init__(
+        self, terrain: TerrainMap, count: int, rng: np.random.Generator, wide: int | None = None
+    ) -> None:
+        self.terrain = terrain
+        self.count = count
+        self.wide = max(wide or 4 * count, count)
+        self.rng = rng
+        self.cloud = _empty_cloud(1)
+        # On a slope, range noise is horizontal too; the map's rms slope says how much.
+        cell = terrain.cell_m
+        self.slope = float(np.sqrt(2 * terrain.structure_m2(np.array([cell]))[0])) / cell
+
+    def start(self, mean: FloatArray, covariance: FloatArray) -> None:
+        """Draw the cloud around a Gaussian of (east, north, turn, scale, depth bias), (5,) and (5, 5).
+
+        Half of the particles are drawn three times as wide and carry the weights to match, so that a
+        start error of three or four sigmas still has particles beside it.
+        """
+        n = self.wide
+        root = np.linalg.cholesky(covariance[:4, :4] + 1e-12 * np.eye(4))
+        white = self.rng.standard_normal((n, 4))
+        stretch = np.ones((n, 4))
+        stretch[n // 2 :, :2] = 3.0
+        white *= stretch
+        distance = np.sum(white[:, :2] ** 2, axis=1)
+        proposal = 0.5 * np.exp(-0.5 * distance) + 0.5 * np.exp(-0.5 * distance / 9.0) / 9.0
+        states = mean[:4] + white @ root.T
+        # The depth bias that goes with each state, and what is left of its variance.
+        slope = np.linalg.solve(covariance[:4, :4] + 1e-12 * np.eye(4), covariance[:4, 4])
+        bias = mean[4] + (states - mean[:4]) @ slope
+        left = max(float(covariance[4, 4] - covariance[:4, 4] @ slope), 1e-6)
+        east, north, turn, scale = np.ascontiguousarray(states.T)
+        self.cloud = Cloud(
+            east,
+            north,
+            turn,
+            scale,
+            bias=bias,
+            bias_var=np.full(n, left),
+            log_weight=-0.5 * distance - np.log(proposal),
+        )
+
+    def predict(self, step_e: float, step_n: float, walk_m2: float) -> None:
+        """Move every particle by what its scale and heading bias make of a dead-reckoned step."""
+        c = self.cloud
+        noise = self.rng.standard_normal((2, c.count), dtype=np.float32)
+        _move(c.east, c.north, c.turn, c.scale, step_e, step_n, np.sqrt(walk_m2), noise)
+
+    def shift(self, jump: FloatArray) -> None:
+        """Move every offset: the dead-reckoned position jumped."""
+        self.cloud.east += jump[0]
+        self.cloud.north += jump[1]
+
+    def update(
+        self, soundings: Soundings, easting_m: float, northing_m: float, step_m: float,
+        bias_walk_m2: float,
+    ) -> float:  # fmt: skip
+        """Weigh the cloud by an update's soundings; resample when few particles carry it.
+
+        Returns
+        -------
+        The greatest share of soundings that fit at any particle: 0 when all are off the map.
+        """
+        noise = sounding_noise(soundings, self.terrain, self.slope, step_m)
+        c = self.cloud
+        effective, fitting = _weigh(
+            self.terrain.height_m, self.terrain.frame, c.east, c.north, c.turn, c.bias, c.bias_var,
+            c.log_weight, easting_m, northing_m, soundings.east_m, soundings.north_m,
+            soundings.elevation_m, noise.inflated_m2, bias_walk_m2,
+        )  # fmt: skip
+        if effective < 0.5 * c.count:
+            self._resample()
+        return fitting / max(soundings.count, 1)
+
+    def fuse(self, offset_m: FloatArray, covariance_m2: FloatArray) -> None:
+        """Weigh the cloud by an outside fix (2,) of the offset; one in twenty may be wrong."""
+        c = self.cloud
+        d = np.stack([c.east - offset_m[0], c.north - offset_m[1]])
+        distance = np.einsum("in,ij,jn->n", d, np.linalg.inv(covariance_m2), d)
+        c.log_weight += np.log(0.95 * np.exp(-0.5 * distance) + 0.05 * np.exp(-0.5 * 9.0))
+        c.log_weight -= c.log_weight.max()
+
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (5,) and covariance (5, 5) of east, north, turn, scale and depth bias."""
+        c = self.cloud
+        mean, covariance = _moments(
+            c.east, c.north, c.turn, c.scale, c.bias, c.bias_var, c.log_weight
+        )
+        return mean, covariance
+
+    def share_within(self, mean: FloatArray, covariance: FloatArray, sigmas: float) -> float:
+        """Weight of the particles within an ellipse of the horizontal Gaussian given."""
+        c = self.cloud
+        weight = np.exp(c.log_weight - c.log_weight.max())
+        d = np.stack([c.east - mean[0], c.north - mean[1]])
+        distance = np.einsum("in,ij,jn->n", d, np.linalg.inv(covariance[:2, :2]), d)
+        return float(weight[distance < sigmas**2].sum() / weight.sum())
+
+    def _resample(self) -> None:
+        mean, covariance = self.moments()
+        spread = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+        single = spread < _RIVALS_M
+        n = self.count if spread < 2 * _RIVALS_M else self.wide
+        # Silverman's rule for four dimensions.
+        h = (4.0 / 6.0) ** (1 / 8) * n ** (-1 / 8)
+        kernel = covariance[:4, :4].copy()
+        if not single:
+            kernel = np.diag(np.diag(kernel))
+            kernel[0, 0] = min(kernel[0, 0], (_KERNEL_M / h) ** 2)
+            kernel[1, 1] = min(kernel[1, 1], (_KERNEL_M / h) ** 2)
+        root = h * np.linalg.cholesky(kernel + 1e-14 * np.eye(4))
+        keep = np.sqrt(1 - h * h) if single else 1.0
+        c = self.cloud
+        noise = self.rng.standard_normal((4, n), dtype=np.float32)
+        chosen = _systematic(c.log_weight, n, self.rng.random())
+        east, north, turn, scale = _regularise(
+            c.east, c.north, c.turn, c.scale, chosen, mean, keep, root, noise
+        )
+        self.cloud = Cloud(
+            east,
+            north,
+            turn,
+            scale,
+            bias=c.bias[chosen],
+            bias_var=c.bias_var[chosen],
+            log_weight=np.zeros(n),
+        )
+
+
+def _empty_cloud(n: int) -> Cloud:
+    east, north, turn, scale, bias, bias_var, log_weight = np.zeros((7, n))
+    return Cloud(east, north, turn, scale, bias, bias_var, log_weight)
+
+
+@numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"})
+def _move(east, north, turn, scale, step_e, step_n, walk, noise):  # type: ignore[no-untyped-def]
+    for i in range(east.size):
+        east[i] += scale[i] * step_e + turn[i] * step_n + walk * noise[0, i]
+        north[i] += scale[i] * step_n - turn[i] * step_e + walk * noise[1, i]
+
+
+@numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"})
+def _weigh(  # type: ignore[no-untyped-def]
+    heights, frame, east, north, turn, bias, bias_var, log_weight, pe, pn, oe, on, z, r, walk
+):
+    """Add log likelihoods, normalise the greatest to 0; return the effective number and the fit."""
+    top = -np.inf
+    met = 0
+    for i in range(east.size):
+        gain, bias[i], bias_var[i], fitting = bias_marginal(
+            heights, frame, east[i], north[i], turn[i], bias[i], bias_var[i], pe, pn, oe, on, z, r,
+            walk,
+        )  # fmt: skip
+        log_weight[i] += gain
+        met = max(met, fitting)
+        top = max(top, log_weight[i])
+    total = 0.0
+    square = 0.0
+    for i in range(east.size):
+        log_weight[i] -= top
+        # Below e^-30 a particle is dead weight: spare the exponential.
+        if log_weight[i] > -30.0:
+            w = np.exp(log_weight[i])
+            total += w
+            square += w * w
+    return total * total / square, met
+
+
+@numba.njit(cache=True)
+def _moments(east, north, turn, scale, bias, bias_var, log_weight):  # type: ignore[no-untyped-def]
+    mean = np.zeros(5)
+    total = 0.0
+    top = log_weight.max()
+    for i in range(east.size):
+        w = np.exp(log_weight[i] - top)
+        total += w
+        mean[0] += w * east[i]
+        mean[1] += w * north[i]
+        mean[2] += w * turn[i]
+        mean[3] += w * scale[i]
+        mean[4] += w * bias[i]
+    mean /= total
+    covariance = np.zeros((5, 5))
+    d = np.empty(5)
+    for i in range(east.size):
+        w = np.exp(log_weight[i] - top) / total
+        d[0] = east[i] - mean[0]
+        d[1] = north[i] - mean[1]
+        d[2] = turn[i] - mean[2]
+        d[3] = scale[i] - mean[3]
+        d[4] = bias[i] - mean[4]
+        for a in range(5):
+            for b in range(a + 1):
+                covariance[a, b] += w * d[a] * d[b]
+        covariance[4, 4] += w * bias_var[i]
+    for a in range(5):
+        for b in range(a):
+            covariance[b, a] = covariance[a, b]
+    return mean, covariance
+
+
+@numba.njit(cache=True)
+def _systematic(log_weight, n, offset):  # type: ignore[no-untyped-def]
+    """Indices (n,) drawn by systematic resampling."""
+    weight = np.exp(log_weight - log_weight.max())
+    step = weight.sum() / n
+    chosen = np.empty(n, np.int64)
+    i = 0
+    reached = weight[0]
+    for k in range(n):
+        at = (k + offset) * step
+        while reached < at and i < weight.size - 1:
+            i += 1
+            reached += weight[i]
+        chosen[k] = i
+    return chosen
+
+
+@numba.njit(cache=True)
+def _regularise(east, north, turn, scale, chosen, mean, keep, root, noise):  # type: ignore[no-untyped-def]
+    """Shrink the chosen particles to the mean by `keep` and add the kernel's noise."""
+    n = chosen.size
+    out = np.empty((4, n))
+    for k in range(n):
+        i = chosen[k]
+        out[0, k] = mean[0] + keep * (east[i] - mean[0])
+        out[1, k] = mean[1] + keep * (north[i] - mean[1])
+        out[2, k] = mean[2] + keep * (turn[i] - mean[2])
+        out[3, k] = mean[3] + keep * (scale[i] - mean[3])
+        for a in range(4):
+            for b in range(a + 1):
+                out[a, k] += root[a, b] * noise[b, k]
+    return out[0], out[1], out[2], out[3]

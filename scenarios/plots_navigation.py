@@ -1,0 +1,122 @@
+"""Pictures of `locate`: the track on the prior map, its uncertainty and status against time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+from localization.navfile import NavTable
+from perception.files import whole_file
+from perception.records import Grid, Trajectory
+
+STATUS_COLOURS = {
+    "converged": "#1b7f3b",
+    "searching": "#e08a00",
+    "dead-reckoning": "#5a6b7b",
+    "lost": "#c81e1e",
+}
+
+
+def draw_navigation(
+    path: Path, prior: Grid, nav: NavTable, causal: Trajectory, smoothed: Trajectory
+) -> None:
+    """Draw `locate.png`: map with tracks on the left, sigma and offset against time on the right."""
+    figure = plt.figure(figsize=(13, 6.5), constrained_layout=True)
+    panels = figure.add_gridspec(2, 2, width_ratios=[1.25, 1])
+    _draw_map(figure.add_subplot(panels[:, 0]), prior, nav, causal, smoothed)
+    _draw_sigma(figure.add_subplot(panels[0, 1]), causal, smoothed)
+    _draw_offset(figure.add_subplot(panels[1, 1]), nav, causal, smoothed)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+    plt.close(figure)
+
+
+def _window(prior: Grid, *tracks: Trajectory) -> tuple[float, float, float, float]:
+    east = np.concatenate([t.easting_m[np.isfinite(t.easting_m)] for t in tracks])
+    north = np.concatenate([t.northing_m[np.isfinite(t.northing_m)] for t in tracks])
+    margin = 0.1 * max(np.ptp(east), np.ptp(north), 20 * prior.cell_m)
+    return (
+        max(east.min() - margin, prior.west_m),
+        min(east.max() + margin, prior.east_m),
+        max(north.min() - margin, prior.south_m),
+        min(north.max() + margin, prior.north_m),
+    )
+
+
+def _draw_map(
+    axes: Axes, prior: Grid, nav: NavTable, causal: Trajectory, smoothed: Trajectory
+) -> None:
+    # Large maps are thinned for the picture: no screen shows more than some 1,000 cells a side.
+    every = max(1, max(prior.shape) // 1200)
+    image = axes.imshow(
+        prior.elevation_m[::every, ::every],
+        extent=(prior.west_m, prior.east_m, prior.south_m, prior.north_m),
+        cmap="viridis",
+        interpolation="nearest",
+    )
+    axes.figure.colorbar(image, ax=axes, label="elevation (m)", shrink=0.8)
+    axes.plot(nav.easting_m, nav.northing_m, color="white", lw=1.0, ls="--", label="dead reckoning")
+    axes.plot(smoothed.easting_m, smoothed.northing_m, color="black", lw=1.0, label="smoothed")
+    status = np.array(causal.status)
+    for name, colour in STATUS_COLOURS.items():
+        chosen = status == name
+        if chosen.any():
+            axes.plot(
+                causal.easting_m[chosen], causal.northing_m[chosen], ".", ms=3, color=colour,
+                label=f"causal, {name}",
+            )  # fmt: skip
+    west, east, south, north = _window(prior, causal)
+    if west < east and south < north:
+        axes.set_xlim(west, east)
+        axes.set_ylim(south, north)
+    axes.set_xlabel("easting (m)")
+    axes.set_ylabel("northing (m)")
+    axes.ticklabel_format(useOffset=False, style="plain")
+    axes.tick_params(axis="x", labelrotation=30)
+    axes.legend(loc="best", fontsize=8)
+    axes.set_title("Track on the prior map")
+
+
+def _sigma(t: Trajectory) -> np.ndarray:
+    return np.hypot(t.sigma_easting_m, t.sigma_northing_m)
+
+
+def _minutes(t: Trajectory) -> np.ndarray:
+    return (t.time_s - np.nanmin(t.time_s)) / 60.0
+
+
+def _draw_sigma(axes: Axes, causal: Trajectory, smoothed: Trajectory) -> None:
+    minutes = _minutes(causal)
+    axes.semilogy(minutes, _sigma(causal), color="black", lw=1, label="causal sigma")
+    axes.semilogy(minutes, _sigma(smoothed), color="black", lw=1, ls=":", label="smoothed sigma")
+    axes.semilogy(minutes, causal.protection_m, color="tab:purple", lw=1, label="protection level")
+    status = np.array(causal.status)
+    low, high = axes.get_ylim()
+    for name, colour in STATUS_COLOURS.items():
+        axes.fill_between(
+            minutes, low, high, where=status == name, color=colour, alpha=0.12, lw=0, label=name
+        )
+    axes.set_ylim(low, high)
+    axes.set_ylabel("metres")
+    axes.set_xlabel("minutes")
+    axes.legend(fontsize=7, ncol=2)
+    axes.set_title("How well the position is known")
+
+
+def _draw_offset(axes: Axes, nav: NavTable, causal: Trajectory, smoothed: Trajectory) -> None:
+    minutes = _minutes(causal)
+    for t, style in ((causal, "-"), (smoothed, ":")):
+        axes.plot(minutes, t.easting_m - nav.easting_m, style, color="tab:blue", lw=1,
+                  label="east" if style == "-" else None)  # fmt: skip
+        axes.plot(minutes, t.northing_m - nav.northing_m, style, color="tab:red", lw=1,
+                  label="north" if style == "-" else None)  # fmt: skip
+    axes.set_xlabel("minutes")
+    axes.set_ylabel("offset (m)")
+    axes.legend(fontsize=8)
+    axes.set_title("Offset from dead reckoning (dotted: smoothed)")
