@@ -85,7 +85,7 @@ def track_bottom(
     """
     config = config or BottomConfig()
     sides = [_log_power(side) for side in (port_power, starboard_power) if np.isfinite(side).any()]
-    n, m = port_power.shape
+    n = len(port_power)
     if not sides:
         nothing = np.full(n, np.nan)
         return BottomTrack(nothing, nothing.copy(), nothing.copy(), np.zeros(n, bool))
@@ -128,7 +128,7 @@ def _coarse_track(
     # Two rounds: levels of water and floor from the track, then the track from the levels.
     for _ in range(2):
         water, floor, spread = _levels(image, track, first_cell)
-        cost = _change_cost(image, water, floor, spread, first_cell)
+        cost = _change_cost(image, water, floor, spread, first_cell, float(np.median(track)))
         track = _least_cost_path(cost, config.jump_cost)
     contrast = _edge_contrast(image, track, first_cell)
     return track * float(block), contrast
@@ -186,7 +186,12 @@ def _filled(values: FloatArray, fallback: float) -> FloatArray:
 
 
 def _change_cost(
-    image: FloatArray, water: FloatArray, floor: FloatArray, spread: float, first_cell: int
+    image: FloatArray,
+    water: FloatArray,
+    floor: FloatArray,
+    spread: float,
+    first_cell: int,
+    usual: float,
 ) -> FloatArray:
     """Return the cost of the floor beginning at each cell: log likelihood ratios, limited per cell."""
     n, cells = image.shape
@@ -196,7 +201,11 @@ def _change_cost(
     sums = np.concatenate([np.zeros((n, 1)), np.cumsum(ratio, axis=1, dtype=float)], axis=1)
     k = np.arange(cells)
     after_to = np.minimum(cells, np.maximum(k + 3, ((1 + _AFTER) * k).astype(int) + 1))
-    cost = 2 * sums[:, k] - sums[:, after_to]
+    # Means and not sums: the far floor is often as dark as water, and would outvote the true edge by
+    # its number alone. The usual range brings the score back to the scale of single cells.
+    before = sums[:, k] / np.maximum(k - first_cell, 1)
+    after = (sums[:, after_to] - sums[:, k]) / np.maximum(after_to - k, 1)
+    cost = usual * (before - after)
     # A ping without any echo would otherwise drag the track to the far end at no limit.
     low = cost.min(axis=1, keepdims=True)
     cost = np.minimum(cost - low, 20 * _CELL_LIMIT)

@@ -34,7 +34,8 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class BumpFit:
-    """The best bump (`sign` 1) or pit (-1): parameters x0, y0, log|A|, log sx, log sy, log beta.
+    """The best bump (`sign` 1) or pit (-1): parameters x0, y0, log|A|, log sx, log sy, log beta,
+    log kappa.
 
     `gain` is the log likelihood over that of a flat floor, priors included.
     """
@@ -51,27 +52,39 @@ class BumpFit:
 
 
 # A highlight above this many times nominal is "bright" and no more.
-HIGHLIGHT_CAP = 4.0
+HIGHLIGHT_CAP = 5.0
 # Priors in logarithms: objects are about as long as wide; shapes lie between a Gaussian and a flat top.
 _ASPECT_SIGMA = 0.5
 _SHAPE_MEAN, _SHAPE_SIGMA = float(np.log(1.7)), 0.6
 _SHAPE_BOUNDS = (float(np.log(0.8)), float(np.log(8.0)))
+# The floor's angular law is near Lambert's square, but recorders and sediments differ.
+_LAW_MEAN, _LAW_SIGMA = float(np.log(1.8)), 0.35
 _FACETS_PER_BIN = 1.5
-_ROUNDS = 40
+# Rounds of climbing from every start, and from the best of each kind afterwards.
+_FIRST_ROUNDS, _LAST_ROUNDS = 5, 25
 
 
 def fit_patch(patch: Patch, starts: list[tuple[float, FloatArray]]) -> BumpFit | None:
     """Return the most likely fit over all starts (sign, parameters), or None where none converges."""
     flat_value = _flat_likelihood(patch)
-    fits = [_climb(patch, sign, start, flat_value) for sign, start in starts]
-    found = [fit for fit in fits if fit is not None]
+    first = [_climb(patch, sign, start, flat_value, _FIRST_ROUNDS) for sign, start in starts]
+    last = []
+    for sign in (1.0, -1.0):
+        own = sorted((f for f in first if f is not None and f.sign == sign), key=lambda f: -f.gain)
+        # A kind that is far behind after the first rounds will not catch up.
+        best = max((f.gain for f in first if f is not None), default=0.0)
+        for fit in own[:1]:
+            if fit.gain > 0.5 * best:
+                last.append(_climb(patch, sign, fit.parameters, flat_value, _LAST_ROUNDS))
+    found = [fit for fit in last if fit is not None]
     return max(found, key=lambda fit: fit.gain) if found else None
 
 
 def _flat_likelihood(patch: Patch) -> float:
-    e = np.minimum(patch.ratio[np.isfinite(patch.ratio)], HIGHLIGHT_CAP)
+    e = patch.ratio[np.isfinite(patch.ratio)]
     mean = 1.0 + patch.leak
-    return float(-patch.weight * (e / mean + np.log(mean)).sum())
+    each = np.where(e < HIGHLIGHT_CAP, e / mean + np.log(mean), HIGHLIGHT_CAP / mean)
+    return float(-patch.weight * each.sum())
 
 
 def _prior(parameters: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -83,13 +96,19 @@ def _prior(parameters: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     gradient[3], gradient[4], gradient[5] = -aspect, aspect, -shape
     information[3:5, 3:5] = np.array([[1, -1], [-1, 1]]) / _ASPECT_SIGMA**2
     information[5, 5] = 1 / _SHAPE_SIGMA**2
+    law = (parameters[6] - _LAW_MEAN) / _LAW_SIGMA**2
+    gradient[6], information[6, 6] = -law, 1 / _LAW_SIGMA**2
     value = -0.5 * (
-        aspect * (parameters[3] - parameters[4]) + shape * (parameters[5] - _SHAPE_MEAN)
+        aspect * (parameters[3] - parameters[4])
+        + shape * (parameters[5] - _SHAPE_MEAN)
+        + law * (parameters[6] - _LAW_MEAN)
     )
     return float(value), gradient, information
 
 
-def _climb(patch: Patch, sign: float, start: FloatArray, flat_value: float) -> BumpFit | None:
+def _climb(
+    patch: Patch, sign: float, start: FloatArray, flat_value: float, rounds: int
+) -> BumpFit | None:
     """Climb the posterior from `start` by damped Fisher scoring."""
     ground_far = np.sqrt(
         max(
@@ -105,14 +124,16 @@ def _climb(patch: Patch, sign: float, start: FloatArray, flat_value: float) -> B
     damping = 1e-2
     value, gradient, information = fisher_step(at, sign, patch.ratio, *fixed)
     prior_value, prior_gradient, prior_information = _prior(at)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         whole = information + prior_information
         scale = np.diag(np.diag(whole) * damping + 1e-6)
         step = np.linalg.solve(whole + scale, gradient + prior_gradient)
         # A logarithm moves by half at most, a place by the object's own width: the model is not linear.
         width = np.exp(at[3:5])
         step = np.clip(
-            step, -np.array([*width, 0.5, 0.5, 0.5, 0.7]), np.array([*width, 0.5, 0.5, 0.5, 0.7])
+            step,
+            -np.array([*width, 0.5, 0.5, 0.5, 0.7, 0.3]),
+            np.array([*width, 0.5, 0.5, 0.5, 0.7, 0.3]),
         )
         trial = at + step
         trial[5] = np.clip(trial[5], *_SHAPE_BOUNDS)

@@ -258,9 +258,6 @@ def _peak_row(shadow: _Shadow) -> int:
 
 # A patch is averaged down to at most this many lines and bins: the fit's cost is their product.
 _PATCH_LINES, _PATCH_BINS = 28, 150
-# A model shadow is never darker than this: at the true level a single lit sample where the family of shapes
-# has none would outweigh fifty that agree.
-_LEAST_LEAK = 0.15
 
 
 def _patch(
@@ -302,7 +299,7 @@ def _patch(
         start_m=col0 * sample_m,
         step_m=wide * sample_m,
         weight=float(np.clip(weight, 0.2, 8.0)),
-        leak=max(levels.shadow_level, _LEAST_LEAK),
+        leak=levels.shadow_level,
     )
 
 
@@ -326,7 +323,17 @@ def _starts(
     return [
         (
             sign,
-            np.array([x0, y0, np.log(a), np.log(size * half), np.log(size * half), np.log(beta)]),
+            np.array(
+                [
+                    x0,
+                    y0,
+                    np.log(a),
+                    np.log(size * half),
+                    np.log(size * half),
+                    np.log(beta),
+                    np.log(1.8),
+                ]
+            ),
         )
         for sign, beta, size, x0, a in guesses
     ]
@@ -365,7 +372,7 @@ def _explains(fit: BumpFit, shadow: _Shadow, drop: float, track: Track) -> bool:
 def _of_fit(
     fit: BumpFit, start_m: float, end_m: float, drop: float, drop_sigma: float, config: ObjectConfig
 ) -> ObjectRow:
-    x0, y0, _, log_sx, log_sy, log_beta = fit.parameters
+    x0, y0, _, log_sx, log_sy, log_beta, _ = fit.parameters
     height = fit.height_m
     beta = float(np.exp(log_beta))
     # Heights scale with the sonar's height above the floor; log A has the fit's own sigma.

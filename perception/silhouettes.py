@@ -12,17 +12,22 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-# Parameters in the order of the vector: x0, y0, log|A|, log sx, log sy, log beta.
-N_PARAMETERS = 6
+# Parameters in the order of the vector: x0, y0, log|A|, log sx, log sy, log beta, log kappa. The last is the
+# exponent of the floor's angular law, cos^kappa of the incidence (Lambert: 2).
+N_PARAMETERS = 7
+
+# The likelihood takes no mean for darker than this. At a shadow's true level one lit sample where the family
+# of shapes has none would outweigh fifty that agree; dark enough is dark.
+LEAST_MEAN = 0.15
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True)
 def predict(parameters, sign, drop_m, along_m, start_m, step_m, leak, facet_m, out):  # type: ignore[no-untyped-def]
     """Fill `out` (n, m) with the mean echo per slant bin, 1 where the flat floor shows.
 
     Parameters
     ----------
-    parameters : (6,) x0, y0, log|A|, log sx, log sy, log beta (metres; x is ground range).
+    parameters : (7,) x0, y0, log|A|, log sx, log sy, log beta, log kappa (metres; x is ground range).
     sign : 1 hill, -1 crater.
     drop_m, along_m : (n,) height of the sonar above the floor and place along the track, per ping.
     start_m, step_m : near edge of the first bin, width of a bin, slant.
@@ -33,60 +38,77 @@ def predict(parameters, sign, drop_m, along_m, start_m, step_m, leak, facet_m, o
     x0, y0 = parameters[0], parameters[1]
     height = sign * np.exp(parameters[2])
     sx, sy, beta = np.exp(parameters[3]), np.exp(parameters[4]), np.exp(parameters[5])
-    stop_m = start_m + m * step_m
+    kappa = np.exp(parameters[6])
+    # The bump ends where it is 1/500 of its height; outside only its shadow remains.
+    q_end = 12.4 ** (1.0 / beta)
     for i in range(n):
         drop = drop_m[i]
+        dy = ((along_m[i] - y0) / sy) ** 2
         for k in range(m):
             out[i, k] = 0.0
-        dy = ((along_m[i] - y0) / sy) ** 2
-        # Facets begin before the patch: a hill nearer in casts its shadow into it, layover reaches out of it.
-        near = max(start_m * start_m - drop * drop, 0.0) ** 0.5
-        far = max(stop_m * stop_m - drop * drop, 0.01) ** 0.5
-        x_low = max(near - 0.5 * facet_m - max(height, 0.0) * drop / max(near, drop), 0.01)
-        x_high = far + max(-height, 0.0) * drop / max(far, drop) + facet_m
-        count = int((x_high - x_low) / facet_m) + 1
-        x_before = x_low
-        z_before = _height(x_before, dy, x0, sx, height, beta)
-        r_before = (x_before * x_before + (drop - z_before) ** 2) ** 0.5
-        # Elevation angle's tangent; the largest so far hides all below it.
-        horizon = (z_before - drop) / x_before
-        over_before = 0.0
-        for j in range(1, count + 1):
-            x = x_low + j * facet_m
-            z = _height(x, dy, x0, sx, height, beta)
-            r = (x * x + (drop - z) ** 2) ** 0.5
-            tangent = (z - drop) / x
-            over = tangent - horizon
-            seen = 1.0
-            if over < 0.0:
-                # The facet's part before the horizon is crossed.
-                seen = 0.0
-                if over_before >= 0.0 and over_before - over > 0:
-                    seen = over_before / (over_before - over)
-            elif over_before < 0.0:
-                seen = over / (over - over_before)
-            if over > 0.0:
-                horizon = tangent
-            if seen > 0.0:
-                dx, dz = x - x_before, z - z_before
-                xm, dm = 0.5 * (x + x_before), drop - 0.5 * (z + z_before)
-                length = (dx * dx + dz * dz) ** 0.5
-                ray = (xm * xm + dm * dm) ** 0.5
-                cosine = (dm * dx + xm * dz) / (length * ray)
-                if cosine > 0.0:
-                    _deposit(out, i, r_before, r, seen * cosine * cosine * length, start_m, step_m)
-            x_before, z_before, r_before = x, z, r
-            over_before = min(over, 0.0) if over < 0.0 else 0.0
+        x_low = x_high = 1e9
+        if dy < q_end:
+            half = sx * (q_end - dy) ** 0.5
+            x_low, x_high = max(x0 - half, 0.02 * drop), x0 + half
+        if x_high <= x_low or x_low >= 1e8:
+            for k in range(m):
+                out[i, k] = 1.0 + leak
+            continue
+        resume = _trace(
+            out[i], x_low, x_high, dy, x0, sx, height, beta, kappa, drop, start_m, step_m, facet_m
+        )
+        r_low, r_resume = (
+            (x_low * x_low + drop * drop) ** 0.5,
+            (resume * resume + drop * drop) ** 0.5,
+        )
         for k in range(m):
-            ray = start_m + (k + 0.5) * step_m
+            near, far = start_m + k * step_m, start_m + (k + 1) * step_m
+            floor = max(min(far, r_low) - near, 0.0) + max(far - max(near, r_resume), 0.0)
+            ray = 0.5 * (near + far)
             ground = max(ray * ray - drop * drop, 0.25 * step_m * step_m) ** 0.5
-            # Flat floor: cos^2 of incidence times the ground length of a bin.
-            flat = (drop / ray) ** 2 * step_m * ray / ground
-            out[i, k] = out[i, k] / flat + leak
+            # Flat floor: cos^kappa of the incidence times the ground length of a bin.
+            flat = (drop / ray) ** kappa * step_m * ray / ground
+            out[i, k] = out[i, k] / flat + min(floor / step_m, 1.0) + leak
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True)
+def _trace(row, x_low, x_high, dy, x0, sx, height, beta, kappa, drop, start_m, step_m, facet_m):  # type: ignore[no-untyped-def]
+    """Sum the lit facets of one line into `row`; return the ground range where the flat floor is lit again."""
+    count = min(max(int((x_high - x_low) / facet_m) + 1, 16), 600)
+    dx = (x_high - x_low) / count
+    x_before, z_before = x_low, _height(x_low, dy, x0, sx, height, beta)
+    r_before = (x_before * x_before + (drop - z_before) ** 2) ** 0.5
+    # Tangent of the elevation angle; the largest so far hides all below it.
+    horizon = min((z_before - drop) / x_before, -drop / x_before)
+    over_before = 0.0
+    for j in range(1, count + 1):
+        x = x_low + j * dx
+        z = _height(x, dy, x0, sx, height, beta)
+        r = (x * x + (drop - z) ** 2) ** 0.5
+        tangent = (z - drop) / x
+        over = tangent - horizon
+        seen = 1.0
+        if over < 0.0:
+            seen = 0.0
+        elif over_before < 0.0:
+            # Only the facet's part above the ray is lit.
+            seen = over / (over - over_before)
+        if over > 0.0:
+            horizon = tangent
+        if seen > 0.0:
+            dz = z - z_before
+            xm, dm = 0.5 * (x + x_before), drop - 0.5 * (z + z_before)
+            length = (dx * dx + dz * dz) ** 0.5
+            cosine = (dm * dx + xm * dz) / (length * (xm * xm + dm * dm) ** 0.5)
+            if cosine > 0.0:
+                _deposit(row, r_before, r, seen * cosine**kappa * length, start_m, step_m)
+        x_before, z_before, r_before = x, z, r
+        over_before = min(over, 0.0)
+    return max(x_high, -drop / horizon if horizon < 0 else 1e9)
+
+
+@njit(cache=True)
 def _height(x, dy, x0, sx, height, beta):  # type: ignore[no-untyped-def]
     q = ((x - x0) / sx) ** 2 + dy
     if q <= 1e-12:
@@ -97,43 +119,44 @@ def _height(x, dy, x0, sx, height, beta):  # type: ignore[no-untyped-def]
     return height * np.exp(-0.5 * power)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
-def _deposit(out, i, r_a, r_b, energy, start_m, step_m):  # type: ignore[no-untyped-def]
+@njit(cache=True)
+def _deposit(row, r_a, r_b, energy, start_m, step_m):  # type: ignore[no-untyped-def]
     """Spread a facet's energy evenly over the bins between its two ends' slant ranges."""
     low = (min(r_a, r_b) - start_m) / step_m
     high = (max(r_a, r_b) - start_m) / step_m
-    m = out.shape[1]
+    m = len(row)
     if high <= 0.0 or low >= m:
         return
     span = high - low
     if span < 1e-6:
         k = int(low)
         if 0 <= k < m:
-            out[i, k] += energy
+            row[k] += energy
         return
     k0, k1 = int(np.floor(low)), int(np.floor(high))
     for k in range(max(k0, 0), min(k1, m - 1) + 1):
         part = (min(high, k + 1.0) - max(low, float(k))) / span
         if part > 0:
-            out[i, k] += energy * part
+            row[k] += energy * part
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True)
 def _soft(mean, cap):  # type: ignore[no-untyped-def]
-    """Compress a mean above 1 smoothly towards `cap`: a hard cut would leave the fit no slope to climb."""
-    if mean <= 1.0:
+    """Compress means above 0.6 cap smoothly: a hard cut would leave the fit no slope to climb."""
+    bend = 0.6 * cap
+    if mean <= bend:
         return mean
-    return 1.0 + (cap - 1.0) * (1.0 - np.exp(-(mean - 1.0) / (cap - 1.0)))
+    return bend + bend * (1.0 - np.exp(-(mean - bend) / bend))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True)
 def fisher_step(
     parameters, sign, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
 ):  # type: ignore[no-untyped-def]
-    """Return the log likelihood, its gradient (6,) and Fisher information (6, 6) of one patch.
+    """Return the log likelihood, its gradient (7,) and Fisher information (7, 7) of one patch.
 
-    Samples are Gamma with the model's mean, compressed above nominal to at most `cap`, and data are cut
-    to the cap, so the strength of a highlight (the object's own reflectivity) says little beyond "bright".
+    Samples are Gamma with the model's mean; data above `cap` are censored and the mean is compressed
+    there, so the strength of a highlight (the object's own reflectivity) says little beyond "bright".
     `weight` is looks times the independent part of the samples; NaN samples say nothing.
     """
     n, m = ratio.shape
@@ -149,7 +172,10 @@ def fisher_step(
         moved[p] = parameters[p]
         for i in range(n):
             for k in range(m):
-                slopes[p, i, k] = (_soft(slopes[p, i, k], cap) - _soft(base[i, k], cap)) / h
+                slopes[p, i, k] = (
+                    max(_soft(slopes[p, i, k], cap), LEAST_MEAN)
+                    - max(_soft(base[i, k], cap), LEAST_MEAN)
+                ) / h
     value = 0.0
     gradient = np.zeros(N_PARAMETERS)
     information = np.zeros((N_PARAMETERS, N_PARAMETERS))
@@ -158,14 +184,19 @@ def fisher_step(
             e = ratio[i, k]
             if np.isnan(e):
                 continue
-            e = min(e, cap)
-            mu = max(_soft(base[i, k], cap), leak)
-            value -= weight * (e / mu + np.log(mu))
+            mu = max(_soft(base[i, k], cap), LEAST_MEAN)
+            # A datum above the cap is censored: it says "more than the cap" and no more.
+            if e < cap:
+                value -= weight * (e / mu + np.log(mu))
+                pull = weight * (e - mu) / (mu * mu)
+            else:
+                value -= weight * cap / mu
+                pull = weight * cap / (mu * mu)
             for p in range(N_PARAMETERS):
                 s = slopes[p, i, k]
                 if s == 0.0:
                     continue
-                gradient[p] += weight * s * (e - mu) / (mu * mu)
+                gradient[p] += pull * s
                 for o in range(p + 1):
                     information[p, o] += weight * s * slopes[o, i, k] / (mu * mu)
     for p in range(N_PARAMETERS):
@@ -174,7 +205,7 @@ def fisher_step(
     return value, gradient, information
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True)
 def log_likelihood(
     parameters, sign, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
 ):  # type: ignore[no-untyped-def]
@@ -186,7 +217,8 @@ def log_likelihood(
     for i in range(n):
         for k in range(m):
             e = ratio[i, k]
-            if not np.isnan(e):
-                mu = max(_soft(base[i, k], cap), leak)
-                value -= weight * (min(e, cap) / mu + np.log(mu))
+            if np.isnan(e):
+                continue
+            mu = max(_soft(base[i, k], cap), LEAST_MEAN)
+            value -= weight * (e / mu + np.log(mu) if e < cap else cap / mu)
     return value
