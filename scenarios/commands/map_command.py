@@ -1,0 +1,146 @@
+"""`bathynav map SURVEY...`: the passes of a survey fused into one map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from scenarios.commands.console import (
+    common_options,
+    out_option,
+    prepare_out,
+    print_table,
+    progress_bars,
+    set_verbosity,
+)
+
+if TYPE_CHECKING:
+    from perception.readers import Survey
+    from scenarios.survey_map import SurveyMap
+
+
+@click.command()
+@click.argument("surveys", nargs=-1, required=True, type=click.Path(path_type=Path))
+@out_option
+@click.option("--cell", type=click.FloatRange(min=0, min_open=True), help="Cell of the map, m.")
+@click.option("--crs", help="Projected CRS in metres (EPSG:N); default the data's UTM zone.")
+@click.option("--prior", type=click.Path(path_type=Path), help="A map to tie the survey to.")
+@click.option("--fixes", type=click.Path(path_type=Path), help="Absolute fixes, a CSV file.")
+@click.option("--install", type=click.Path(path_type=Path), help="Lever arms and mounting, TOML.")
+@click.option("--tide", type=click.Path(path_type=Path), help="Tide, a CSV file.")
+@click.option("--sound-speed", metavar="M_S|PROFILE.csv", help="Sound speed, or its profile.")
+@click.option(
+    "--method",
+    type=click.Choice(["joint", "shadow"]),
+    default="joint",
+    show_default=True,
+    help="All echoes jointly, or heights from shadows alone.",
+)
+@common_options
+def command(
+    surveys: tuple[Path, ...],
+    out: Path,
+    cell: float | None,
+    crs: str | None,
+    prior: Path | None,
+    fixes: Path | None,
+    install: Path | None,
+    tide: Path | None,
+    sound_speed: str | None,
+    method: str,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Turn the passes in SURVEY files into one map with sigma and a corrected track.
+
+    \b
+    bathynav map survey.xtf --out map --fixes surface-fixes.csv
+    """
+    import time
+
+    from mapping.fixes import read_fixes
+    from perception.installation import read_installation
+    from perception.readers import open_survey
+    from scenarios.survey_map import map_survey
+
+    set_verbosity(quiet, verbose)
+    prepare_out(out)
+    absolute = read_fixes(fixes) if fixes is not None else []
+    installation = read_installation(install, tide, sound_speed)
+    began = time.perf_counter()
+    with progress_bars(quiet) as progress:
+        survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
+        for warning in survey.warnings:
+            click.echo(f"note: {warning}", err=True)
+        result = map_survey(survey, fixes=absolute, cell_m=cell, method=method, progress=progress)
+        metrics = _write(out, survey, result, prior)
+    config = {
+        "surveys": [str(p) for p in surveys], "cell_m": cell, "crs": survey.crs, "method": method,
+        "prior": prior, "fixes": fixes, "install": install, "tide": tide,
+        "sound_speed": sound_speed,
+    }  # fmt: skip
+    from scenarios.outputs import write_metrics
+
+    metrics["seconds"] = time.perf_counter() - began
+    write_metrics(out, metrics, config)
+    if not quiet:
+        _tell(metrics, out)
+
+
+def _write(out: Path, survey: Survey, result: SurveyMap, prior: Path | None) -> dict[str, Any]:
+    """Write the folder's files and return its metrics."""
+    from mapping.rasters import write_map
+    from mapping.trajectories import write_trajectory
+    from scenarios.plots_survey import plot_layer, plot_map
+
+    write_map(out / "map.tif", result.grid)
+    write_trajectory(out / "trajectory.csv", result.track)
+    write_trajectory(out / "trajectory-navigated.csv", result.raw_track)
+    _write_soundings(out / "soundings.csv", result)
+    plot_map(out / "map.png", result.grid, result.raw_track, result.track)
+    if result.grid.sigma_m is not None:
+        plot_layer(out / "sigma.png", result.grid, result.grid.sigma_m, "1-sigma, m", "magma")
+    return {}
+
+
+def _write_soundings(path: Path, result: SurveyMap) -> None:
+    """Write what the first returns alone say of the floor below the corrected track."""
+    import numpy as np
+
+    from perception.files import whole_file
+
+    strips = result.corrected.strips
+    columns = [
+        np.concatenate([s.easting_m for s in strips]),
+        np.concatenate([s.northing_m for s in strips]),
+        np.concatenate(
+            [
+                -(s.depth_m + s.altitude_m) + offset_m
+                for s, offset_m in zip(strips, result.corrected.height_m, strict=True)
+            ]
+        ),
+        np.concatenate([s.altitude_sigma_m for s in strips]),
+    ]
+    with whole_file(path) as temporary:
+        np.savetxt(
+            temporary,
+            np.column_stack(columns),
+            fmt="%.3f",
+            delimiter=",",
+            header="easting_m,northing_m,elevation_m,sigma_m",
+            comments="",
+        )
+
+
+def _tell(metrics: dict[str, Any], out: Path) -> None:
+    from scenarios.report.page import format_value
+    from scenarios.report.units import label_and_unit
+
+    rows = []
+    for key, value in metrics.items():
+        label, unit = label_and_unit(key)
+        rows.append((label, f"{format_value(value)} {unit}".rstrip()))
+    print_table("map", rows)
+    click.echo(f"written to {out / 'map.tif'}")

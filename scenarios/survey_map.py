@@ -1,0 +1,188 @@
+"""Sonar files to one map: the method's summary, stage by stage.
+
+Each function is one stage; the arithmetic lives in `perception` and `mapping`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mapping.fixes import PositionFix
+from mapping.fusion import fuse
+from mapping.survey import CorrectedSurvey, correct_survey
+from perception.levels import SHADOW
+from perception.readers import Survey
+from perception.records import FloatArray, Grid, Progress, Swath, Trajectory, silent
+from perception.strips import PassResult, build_strip, common_samples
+
+if TYPE_CHECKING:
+    from perception.inversion import Inversion, Look
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyMap:
+    """What a survey became.
+
+    Attributes
+    ----------
+    grid : the map.
+    track : one pose for every side-scan ping in input order; unusable ones interpolated, pass -1.
+    raw_track : the same poses as the file's own navigation had them.
+    passes : strip, objects, bottom and levels of each pass, as navigated.
+    corrected : strips with corrected poses, and what the pose graph says of itself.
+    inversion : diagnostics of the joint method; None where the map is of shadows alone.
+    """
+
+    grid: Grid
+    track: Trajectory
+    raw_track: Trajectory
+    passes: tuple[PassResult, ...]
+    corrected: CorrectedSurvey
+    inversion: Inversion | None
+
+
+def map_survey(
+    survey: Survey,
+    *,
+    fixes: Sequence[PositionFix] = (),
+    cell_m: float | None = None,
+    method: str = "joint",
+    passes: Sequence[PassResult] | None = None,
+    progress: Progress = silent,
+) -> SurveyMap:
+    """Turn the passes of a survey into one map and one corrected track.
+
+    Parameters
+    ----------
+    method : "joint" inverts shading, shadows and soundings of all passes on one grid;
+        "shadow" fuses the strips of shadow heights.
+    passes : results of `build_passes` where they are at hand.
+    """
+    results = build_passes(survey, progress) if passes is None else tuple(passes)
+    corrected = correct_survey([r.strip for r in results], fixes, progress=progress)
+    track = whole_track(survey, corrected.trajectory)
+    inversion = None
+    if method == "joint":
+        from perception.inversion import invert
+
+        looks = [_look(survey, i, result, corrected, track) for i, result in enumerate(results)]
+        inversion = invert(looks, cell_m=cell_m, crs=survey.crs, progress=progress)
+        grid = inversion.grid
+    else:
+        grid = fuse(
+            corrected.strips,
+            cell_m=cell_m,
+            crs=survey.crs,
+            trajectory=corrected.trajectory,
+            height_sigma_m=corrected.height_sigma_m,
+            progress=progress,
+        )
+    grid = replace(grid, datum=survey.datum)
+    return SurveyMap(grid, track, navigated_track(survey), results, corrected, inversion)
+
+
+def build_passes(survey: Survey, progress: Progress = silent) -> tuple[PassResult, ...]:
+    """Turn every pass into a strip, reading one pass at a time."""
+    results = []
+    for index in range(survey.n_passes):
+        progress("echoes to strips", index, survey.n_passes)
+        results.append(build_strip(survey.swath(index)))
+    progress("echoes to strips", survey.n_passes, survey.n_passes)
+    return tuple(results)
+
+
+def navigated_track(survey: Survey) -> Trajectory:
+    """Return the files' own navigation, one pose a ping, of unknown accuracy (NaN)."""
+    pings = survey.pings
+    unknown = np.full(len(pings), np.nan)
+    return Trajectory(
+        time_s=pings.time_s,
+        easting_m=pings.easting_m,
+        northing_m=pings.northing_m,
+        depth_m=pings.depth_m,
+        heading_rad=pings.heading_rad,
+        sigma_easting_m=unknown,
+        sigma_northing_m=unknown,
+        cov_en_m2=unknown,
+        crs=survey.crs,
+        utc=survey.utc,
+        ping=np.arange(len(pings)),
+        pass_index=pings.pass_index,
+    )
+
+
+def whole_track(survey: Survey, corrected: Trajectory) -> Trajectory:
+    """Carry the correction of the passes' lines over to every ping of the survey.
+
+    The *correction*, not the position, is interpolated by ping number: between lines the files'
+    navigation knows how the vehicle moved better than a straight line does.
+    """
+    raw = navigated_track(survey)
+    if corrected.ping is None:
+        raise ValueError("a survey's trajectory must say which ping each pose belongs to")
+    order = np.argsort(corrected.ping, kind="stable")
+    known = corrected.ping[order]
+    every = np.arange(survey.n_pings)
+
+    def carried(values: FloatArray) -> FloatArray:
+        return np.interp(every, known, values[order])
+
+    def moved(mine: FloatArray, theirs: FloatArray) -> FloatArray:
+        good = np.isfinite(theirs[order] - mine[known])
+        if not good.any():
+            return mine
+        return mine + np.interp(every, known[good], (theirs[order] - mine[known])[good])
+
+    turn = np.angle(np.exp(1j * (corrected.heading_rad[order] - raw.heading_rad[known])))
+    return replace(
+        raw,
+        easting_m=moved(raw.easting_m, corrected.easting_m),
+        northing_m=moved(raw.northing_m, corrected.northing_m),
+        heading_rad=np.mod(raw.heading_rad + np.interp(every, known, turn), 2 * np.pi),
+        sigma_easting_m=carried(corrected.sigma_easting_m),
+        sigma_northing_m=carried(corrected.sigma_northing_m),
+        cov_en_m2=carried(corrected.cov_en_m2),
+    )
+
+
+def corrected_swath(swath: Swath, track: Trajectory, height_offset_m: float) -> Swath:
+    """Return a swath at its corrected poses; a height offset moves the sonar, not the echoes."""
+    return replace(
+        swath,
+        easting_m=track.easting_m[swath.ping],
+        northing_m=track.northing_m[swath.ping],
+        heading_rad=track.heading_rad[swath.ping],
+        depth_m=swath.depth_m - height_offset_m,
+    )
+
+
+def _look(
+    survey: Survey, index: int, result: PassResult, corrected: CorrectedSurvey, track: Trajectory
+) -> Look:
+    """Return one pass as the joint inversion sees it: on one sample size, at corrected poses."""
+    from perception.inversion import Look
+
+    swath = survey.swath(index)
+    port_power, starboard_power, sample_m = common_samples(swath)
+    swath = replace(
+        swath,
+        port=np.sqrt(port_power),
+        starboard=np.sqrt(starboard_power),
+        sample_m=np.full(swath.n_pings, sample_m),
+        flags=None,
+    )
+    port, starboard = result.levels
+    return Look(
+        swath=corrected_swath(swath, track, float(corrected.height_m[index])),
+        altitude_m=result.bottom.altitude_m,
+        altitude_sigma_m=result.bottom.sigma_m,
+        shadow_port=port == SHADOW,
+        shadow_starboard=starboard == SHADOW,
+    )
