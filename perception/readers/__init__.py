@@ -23,6 +23,8 @@ __all__ = ["FORMATS", "PingFlag", "PingTable", "RawFile", "Survey", "open_survey
 # a file reads it, so formats with a sure mark come before those known by their name alone.
 FORMATS = {
     "xtf": "XTF (Triton)",
+    "starfish": "StarFish logdoc",
+    "humminbird": "Humminbird DAT/SON",
 }
 _HEAD_BYTES = 4096
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 FEWEST_PINGS = 10
 # A ping with this many times the usual samples is a corrupt count, and would cost memory in every row.
 _MOST_TIMES_USUAL = 8.0
+_SURFACE_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,6 +271,9 @@ def _table_of(raw: RawFile, number: int, target: str, defects: list[str]) -> Pin
         time_s, heading_rad, east, north, turned, hollow, defects
     )
     depth_m = np.where(misplaced & (pings.depth_m == 0), np.nan, pings.depth_m)
+    # A pressure sensor at the surface swings about zero: that is as little a depth as zero itself.
+    if not np.any(np.abs(np.nan_to_num(depth_m)) > _SURFACE_M):
+        depth_m = np.full(n, np.nan)
     depth_m = _filled(time_s, depth_m)
     samples = _sane_samples(pings.samples, defects)
     with np.errstate(invalid="ignore", divide="ignore"):
