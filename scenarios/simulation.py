@@ -80,10 +80,14 @@ def simulate(
     ----------
     folder : where the paths of `raster` components start; the working folder if absent.
     """
+    # What can be refused is refused before any work is done.
+    _Geodesy(scenario.world.crs)
+    start_time_s(scenario)
+    rasters = _rasters(scenario, folder)
     root = np.random.default_rng(scenario.seed)
     world_rng, prior_rng, survey_rng, fix_rng, return_rng, beam_rng = root.spawn(6)
     progress("building the world", 0, 1)
-    world = build_world(scenario.world, rng=world_rng, rasters=_rasters(scenario, folder))
+    world = build_world(scenario.world, rng=world_rng, rasters=rasters)
     prior = prior_map(world.floor, scenario.world, scenario.prior, rng=prior_rng)
     progress("building the world", 1, 1)
     motion, reckoning, survey = _survey(scenario, world, survey_rng, progress)

@@ -97,22 +97,22 @@ def scatter(
     InputError
         They do not fit.
     """
-    placed: list[tuple[float, float]] = []
-    others = list(taken)
-    for _ in range(200 * max(count, 1)):
-        if len(placed) == count:
-            return placed
-        place = (
-            centre_m[0] + size_m[0] * (rng.random() - 0.5),
-            centre_m[1] + size_m[1] * (rng.random() - 0.5),
-        )
-        if all(np.hypot(place[0] - e, place[1] - n) >= spacing_m for e, n in others):
-            placed.append(place)
-            others.append(place)
-    if len(placed) == count:
-        return placed
+    others = np.full((len(taken) + count, 2), np.inf)
+    others[: len(taken)] = np.reshape(taken, (-1, 2))
+    placed = 0
+    # A crowded area refuses most throws; two hundred for each object fill it to what fits.
+    for throw in rng.random((200 * count, 2)):
+        if placed == count:
+            break
+        place = np.array(centre_m) + np.array(size_m) * (throw - 0.5)
+        used = len(taken) + placed
+        if (np.hypot(*(others[:used] - place).T) >= spacing_m).all():
+            others[used] = place
+            placed += 1
+    if placed == count:
+        return [(float(e), float(n)) for e, n in others[len(taken) :]]
     raise InputError(
-        f"world.terrain: only {len(placed)} of {count} objects fit into "
+        f"world.terrain: only {placed} of {count} objects fit into "
         f"{size_m[0]:g} x {size_m[1]:g} m at {spacing_m:g} m from each other; "
         "lower count or spacing_m, or widen the area"
     )
