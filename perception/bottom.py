@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.signal import savgol_filter
 
 from perception.records import BoolArray, FloatArray
 
@@ -25,13 +26,13 @@ class BottomConfig:
     Attributes
     ----------
     min_altitude_m : ranges below it are the transmit pulse's own; None takes 6 samples.
-    smooth_pings : pings over which the finished track is smoothed (a running line).
+    smooth_pings : pings over which the finished track is smoothed (a running parabola).
     jump_cost : cost of moving the track by one cell of range between pings, in units of the score
         of one clear cell. Small values follow cliffs, large ones hold through noise.
     """
 
     min_altitude_m: float | None = None
-    smooth_pings: int = 7
+    smooth_pings: int = 9
     jump_cost: float = 1.5
 
 
@@ -146,8 +147,13 @@ def _contrast_cost(image: FloatArray, first_cell: int) -> FloatArray:
     after_to = np.minimum(cells, np.maximum(k + 2, (1.4 * k).astype(int) + 1))
     before = (sums[:, k] - sums[:, before_from]) / np.maximum(k - before_from, 1)
     after = (sums[:, after_to] - sums[:, k]) / np.maximum(after_to - k, 1)
-    score = np.clip(after - before, -2.0, 4.0)
-    score[:, : first_cell + 1] = -2.0
+    # The same over a tenth of the range on either side, which is sharp where the long windows are flat.
+    close = np.maximum(2, (0.1 * k).astype(int))
+    near = (
+        sums[:, np.minimum(k + close, cells)] - 2 * sums[:, k] + sums[:, np.maximum(k - close, 0)]
+    )
+    score = np.clip(after - before, -2.0, 4.0) + np.clip(near / close, -2.0, 6.0)
+    score[:, : first_cell + 1] = -4.0
     return (-4.0 * score).astype(np.float32)
 
 
@@ -159,7 +165,8 @@ def _levels(
     k = np.arange(cells)
     water, floor = np.full(cells, np.nan), np.full(cells, np.nan)
     in_water = (k < 0.93 * track[:, None]) & (k >= first_cell)
-    in_floor = (k > 1.02 * track[:, None] + 1) & (k < 1.45 * track[:, None] + 3)
+    # A first track may lie a little early: the floor's level is taken from further out.
+    in_floor = (k > 1.12 * track[:, None] + 1) & (k < 1.6 * track[:, None] + 3)
     for j in range(cells):
         if in_water[:, j].sum() >= max(5, n // 50):
             water[j] = np.median(image[in_water[:, j], j])
@@ -292,7 +299,7 @@ def _refine(
     cost[columns < nearest] = cost.max() + 1
     path = _least_cost_in_band(cost, start, config.jump_cost)
     own = start + np.argmin(cost, axis=1)
-    smooth = _running_line(path + 0.5, config.smooth_pings)
+    smooth = _running_parabola(path + 0.5, config.smooth_pings)
     noise = 1.48 * median_filter(np.abs(own + 0.5 - smooth), min(25, n), mode="nearest")
     return smooth, noise
 
@@ -307,18 +314,15 @@ def _least_cost_in_band(cost: FloatArray, start: np.ndarray, jump_cost: float) -
     return path
 
 
-def _running_line(values: FloatArray, window: int) -> FloatArray:
-    """Smooth by a running straight line, after a running median that drops single wild pings."""
+def _running_parabola(values: FloatArray, window: int) -> FloatArray:
+    """Smooth by a running parabola, after a running median that drops single wild pings."""
     n = len(values)
     if n < 5:
         return values
-    window = min(window, n) | 1
-    calm = median_filter(values, min(5, n), mode="nearest")
-    half = window // 2
-    head = 2 * calm[0] - calm[half:0:-1]
-    tail = 2 * calm[-1] - calm[-2 : -half - 2 : -1]
-    padded = np.concatenate([head, calm, tail])
-    return np.convolve(padded, np.full(window, 1 / window), mode="valid")[:n]
+    calm = median_filter(values, 5, mode="nearest")
+    length = min(window, n if n % 2 else n - 1) | 1
+    # A parabola and not a line: heave over a few pings must not be flattened.
+    return savgol_filter(calm, length, 2, mode="interp") if length > 2 else calm
 
 
 def _assemble(
