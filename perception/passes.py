@@ -27,7 +27,7 @@ class PassConfig:
     gap_s: float = 5.0
     gap_pings: float = 10.0
     gap_m: float = 20.0
-    turn_radius_ranges: float = 1.3
+    turn_radius_ranges: float = 1.0
     turn_rad: float = np.radians(35.0)
     straight_rad: float = np.radians(8.0)
     most_turn_rad: float = np.radians(150.0)
@@ -76,8 +76,8 @@ def split_passes(track: Track, config: PassConfig | None = None) -> Split:
         speed = _typical_speed(track, gaps)
         stopped = _stops(track, gaps, speed, config)
         turning = _turns(track, gaps, speed, config)
-        # A track that curves all along at the range's radius is better kept than lost.
-        if turning.sum() > 0.5 * n:
+        # A track that curves nearly all along at the range's radius is better kept than lost.
+        if turning.sum() > 0.85 * n:
             turning = none
     label = _pieces(track, gaps, turning | stopped, config)
     return Split(_numbered(track, label, config), turning, stopped, gaps)

@@ -1,0 +1,164 @@
+"""StarFish, Humminbird, Lowrance, JSF and our NetCDF: made here and read back; real files where they are."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from perception.readers import open_survey
+
+REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "sidescan"
+
+
+def real(name: str) -> Path:
+    path = REAL / name
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    return path
+
+
+# StarFish
+
+
+def starfish_record(opcode: int, i: int, body: bytes) -> bytes:
+    ms = 1000 + 100 * i
+    head = struct.pack("<BBHBBBBHIH", 1, opcode, 2020, 3, 4, 5, 6, ms, 7, 0)
+    return head + body + b"\x99"
+
+
+def starfish_log(n: int = 40, south: bool = False) -> bytes:
+    rng = np.random.default_rng(5)
+    out = b"StarfishScanlineLog".ljust(1000, b"\0")
+    for i in range(n):
+        zone = b"K" if south else b"P"
+        out += starfish_record(
+            0x21, i, zone + struct.pack("<Bddd", 21, 1459800.0 + 0.2 * i, 213600.0, 1.0)
+        )
+        out += starfish_record(0x20, i, struct.pack("<d", 10.0))
+        out += starfish_record(0x24, i, struct.pack("<d", 3.0))
+        sides = b""
+        for side in range(2):
+            levels = rng.integers(20 + 50 * side, 40 + 50 * side, 100, np.uint8)
+            sides += struct.pack("<4fI", 38, 0, -42, 25, 100) + levels.tobytes()
+        out += starfish_record(0x26, i, sides)
+    return out
+
+
+def test_a_starfish_log_comes_back(tmp_path):
+    path = tmp_path / "a.logdoc"
+    path.write_bytes(starfish_log())
+    survey = open_survey([path])
+    assert survey.n_pings == 40 and survey.crs == "EPSG:32621" and survey.utc
+    swath = survey.swath(0)
+    assert_allclose(swath.northing_m, 1459800.0 + 0.2 * np.arange(40))
+    assert_allclose(np.diff(swath.time_s), 0.1, atol=1e-6)
+    assert_allclose(swath.sample_m, 0.25)
+    assert_allclose(swath.depth_m, 3.0)
+    assert swath.port.max() < 40 and swath.starboard.min() >= 70
+    # Zone 21 at 59.65 W: 2.65 degrees west of its meridian, 13 N: convergence -0.6 degrees.
+    assert_allclose(np.degrees(swath.heading_rad), 10.6, atol=0.02)
+
+
+def test_a_starfish_log_of_the_southern_hemisphere(tmp_path):
+    path = tmp_path / "a.logdoc"
+    path.write_bytes(starfish_log(south=True))
+    assert open_survey([path]).crs == "EPSG:32721"
+
+
+def test_a_starfish_log_with_foreign_bytes_and_a_cut_end_keeps_the_rest(tmp_path):
+    path = tmp_path / "a.logdoc"
+    log = starfish_log()
+    path.write_bytes(log[:5000] + b"\x01\x26noise" * 9 + log[5000:-77])
+    survey = open_survey([path])
+    assert survey.n_pings in (38, 39)
+
+
+def test_the_barbados_log_is_read():
+    survey = open_survey([real("starfish_iver2_barbados_20160112.logdoc")])
+    assert survey.n_pings == 3259 and survey.crs == "EPSG:32621"
+    assert np.isnan(survey.pings.depth_m).all() and np.isnan(survey.pings.altitude_hint_m).all()
+    pings = survey.pings
+    assert pings.northing_m.min() > 1459807 and pings.easting_m.max() < 213635
+    assert survey.swath(0).port.max() <= 188
+
+
+# Humminbird
+
+
+def humminbird_record(number: int, ms: int, channel: int, north: int, levels: np.ndarray) -> bytes:
+    def long(tag: int, value: int) -> bytes:
+        return bytes([tag]) + struct.pack(">i", value)
+
+    head = b"\xc0\xde\xab\x21"
+    head += long(0x80, number) + long(0x81, ms) + long(0x82, -12414199) + long(0x83, north)
+    head += long(0x84, 65536 + 1977) + long(0x85, 65536 + 27) + long(0x87, 52)
+    head += bytes([0x50, channel]) + long(0x92, 455000) + long(0xA0, len(levels)) + b"\x21"
+    return head + levels.astype(np.uint8).tobytes()
+
+
+def humminbird_folder(folder: Path, n: int = 50) -> Path:
+    inner = folder / "R00001"
+    inner.mkdir(parents=True)
+    rng = np.random.default_rng(2)
+    for channel, name in ((2, "B002"), (3, "B003")):
+        data = b""
+        for i in range(n):
+            levels = rng.integers(10 * channel, 10 * channel + 9, 300 + i % 3)
+            data += humminbird_record(2 * i + channel, 100 * i, channel, 4396652 + i, levels)
+        (inner / f"{name}.SON").write_bytes(data)
+    words = (0, 0, 0, 0, 0, 1700000000, -12414199, 4396652, *[0] * 8)
+    (folder / "R00001.DAT").write_bytes(struct.pack(">16i", *words))
+    return folder / "R00001.DAT"
+
+
+def test_a_humminbird_recording_comes_back_by_its_dat_its_folder_or_a_channel(tmp_path):
+    dat = humminbird_folder(tmp_path)
+    for path in (dat, tmp_path / "R00001", tmp_path / "R00001" / "B002.SON"):
+        survey = open_survey([path])
+        assert survey.n_pings == 50 and survey.crs == "EPSG:32612"
+        swath = survey.swath(0)
+        assert_allclose(swath.time_s, 1.7e9 + 0.1 * np.arange(50))
+        assert swath.n_samples == 302 and np.isnan(swath.port[0, 300:]).all()
+        assert np.nanmin(swath.port) >= 20 and np.nanmax(swath.port) < 29
+        assert np.nanmin(swath.starboard) >= 30 and np.nanmax(swath.starboard) < 39
+        assert_allclose(swath.altitude_hint_m, 5.2)
+
+
+def test_humminbird_metres_become_the_known_place():
+    """36.8788 N, 111.5143 W is where the boat was (data sheet); PROJ agrees to a centimetre."""
+    import pyproj
+
+    from perception.readers.humminbird import _geographic
+
+    x, y = np.array([-12414199]), np.array([4396652])
+    lon, lat = _geographic(x, y)
+    there = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +inv +proj=merc +ellps=intl "
+        "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    ).transform(x, y)
+    assert_allclose(lon, there[0], atol=1e-9)
+    assert_allclose(lat, there[1], atol=1e-6)
+
+
+def test_a_corrupt_humminbird_record_is_skipped(tmp_path):
+    dat = humminbird_folder(tmp_path)
+    son = tmp_path / "R00001" / "B003.SON"
+    data = bytearray(son.read_bytes())
+    data[3700:3720] = bytes(20)
+    son.write_bytes(bytes(data[:-40]))
+    survey = open_survey([dat])
+    assert survey.n_pings == 50 and survey.n_passes == 1
+    assert any("corrupt record" in d for d in survey.defects)
+
+
+def test_the_glen_canyon_recording_is_read():
+    survey = open_survey([real("humminbird_pyhum/test.DAT")])
+    assert survey.n_pings == 3453 and survey.n_passes == 1 and survey.crs == "EPSG:32612"
+    swath = survey.swath(0)
+    # Beam in the first ping's field: 197.7 true; the column is quiet out to the first return.
+    assert abs(np.degrees(swath.heading_rad[0]) - 198.0) < 1.0
+    assert np.nanmedian(swath.port[:, 20:40]) < np.nanmedian(swath.port[:, 300:600])
