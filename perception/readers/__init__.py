@@ -25,6 +25,7 @@ FORMATS = {
     "xtf": "XTF (Triton)",
     "starfish": "StarFish logdoc",
     "humminbird": "Humminbird DAT/SON",
+    "netcdf": "NetCDF of pings",
 }
 _HEAD_BYTES = 4096
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from perception.readers import open_survey
+from perception.readers import open_survey, scan_file
+from perception.readers.netcdf import write_netcdf
+from perception.records import InputError, Swath
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "sidescan"
 
@@ -162,3 +164,56 @@ def test_the_glen_canyon_recording_is_read():
     # Beam in the first ping's field: 197.7 true; the column is quiet out to the first return.
     assert abs(np.degrees(swath.heading_rad[0]) - 198.0) < 1.0
     assert np.nanmedian(swath.port[:, 20:40]) < np.nanmedian(swath.port[:, 300:600])
+
+
+# Our own NetCDF
+
+
+def plain_swath(n: int = 60, scanning: bool = False) -> Swath:
+    rng = np.random.default_rng(4)
+    port = rng.random((n, 40)).astype(np.float32)
+    port[:, 35:] = np.nan
+    return Swath(
+        time_s=1.7e9 + 0.25 * np.arange(n), ping=np.arange(n),
+        easting_m=400000.0 + 0.5 * np.arange(n), northing_m=np.full(n, 5.4e6),
+        depth_m=np.full(n, 12.0), heading_rad=np.full(n, np.pi / 2), pitch_rad=np.full(n, 0.02),
+        roll_rad=np.full(n, -0.03), altitude_hint_m=np.full(n, 9.0), sample_m=np.full(n, 0.2),
+        port=np.full((n, 40), np.nan, np.float32) if scanning else port,
+        starboard=2 * port, sound_speed_m_s=np.full(n, 1490.0), crs="EPSG:32619",
+        sonar="made up", frequency_hz=455e3,
+        scan_angle_rad=np.radians(np.linspace(-60, 60, n)) if scanning else None,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("scanning", [False, True])
+def test_a_swath_goes_out_and_comes_back(tmp_path, scanning):
+    swath = plain_swath(scanning=scanning)
+    write_netcdf(tmp_path / "a.nc", swath)
+    survey = open_survey([tmp_path / "a.nc"])
+    assert survey.crs == "EPSG:32619" and survey.utc and survey.n_passes == 1
+    back = survey.swath(0)
+    for name in ("time_s", "easting_m", "northing_m", "depth_m", "heading_rad", "pitch_rad",
+                 "roll_rad", "altitude_hint_m", "sample_m", "sound_speed_m_s"):  # fmt: skip
+        assert_allclose(getattr(back, name), getattr(swath, name), atol=1e-7, err_msg=name)
+    assert_allclose(back.starboard, swath.starboard[:, :35])
+    if scanning:
+        assert_allclose(back.scan_angle_rad, swath.scan_angle_rad)
+        assert np.isnan(back.port).all()
+    else:
+        assert_allclose(back.port, swath.port[:, :35])
+        assert back.scan_angle_rad is None
+
+
+def test_a_netcdf_of_something_else_is_refused_by_what_it_lacks(tmp_path):
+    import netCDF4
+
+    with netCDF4.Dataset(tmp_path / "map.nc", "w") as data:
+        data.createDimension("x", 3)
+        data.createVariable("elevation", "f4", ("x",))
+    with pytest.raises(InputError, match="it lacks time, easting, northing"):
+        scan_file(tmp_path / "map.nc")
+    write_netcdf(tmp_path / "cut.nc", plain_swath())
+    whole = (tmp_path / "cut.nc").read_bytes()
+    (tmp_path / "cut.nc").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"cut\.nc"):
+        scan_file(tmp_path / "cut.nc")
