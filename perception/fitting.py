@@ -37,12 +37,13 @@ class BumpFit:
     """The best bump (`sign` 1) or pit (-1): parameters x0, y0, log|A|, log sx, log sy, log beta,
     log kappa.
 
-    `gain` is the log likelihood over that of a flat floor, priors included.
+    `corner` is 2 for an elliptic footprint, 6 for a rectangular one; `gain` is the log likelihood over that of a flat floor, priors included.
     """
 
     parameters: FloatArray
     covariance: FloatArray
     sign: float
+    corner: float
     gain: float
 
     @property
@@ -58,24 +59,29 @@ _ASPECT_SIGMA = 0.5
 _SHAPE_MEAN, _SHAPE_SIGMA = float(np.log(1.7)), 0.6
 _SHAPE_BOUNDS = (float(np.log(0.8)), float(np.log(8.0)))
 # The floor's angular law is near Lambert's square, but recorders and sediments differ.
-_LAW_MEAN, _LAW_SIGMA = float(np.log(1.8)), 0.35
+_LAW_MEAN, _LAW_SIGMA = float(np.log(1.8)), 0.3
 _FACETS_PER_BIN = 1.5
 # Rounds of climbing from every start, and from the best of each kind afterwards.
 _FIRST_ROUNDS, _LAST_ROUNDS = 5, 25
 
 
-def fit_patch(patch: Patch, starts: list[tuple[float, FloatArray]]) -> BumpFit | None:
-    """Return the most likely fit over all starts (sign, parameters), or None where none converges."""
+def fit_patch(patch: Patch, starts: list[tuple[float, float, FloatArray]]) -> BumpFit | None:
+    """Return the most likely fit over all starts (sign, corner, parameters), or None where none converges."""
     flat_value = _flat_likelihood(patch)
-    first = [_climb(patch, sign, start, flat_value, _FIRST_ROUNDS) for sign, start in starts]
+    first = [
+        _climb(patch, sign, corner, start, flat_value, _FIRST_ROUNDS)
+        for sign, corner, start in starts
+    ]
     last = []
     for sign in (1.0, -1.0):
         own = sorted((f for f in first if f is not None and f.sign == sign), key=lambda f: -f.gain)
         # A kind that is far behind after the first rounds will not catch up.
         best = max((f.gain for f in first if f is not None), default=0.0)
-        for fit in own[:1]:
-            if fit.gain > 0.5 * best:
-                last.append(_climb(patch, sign, fit.parameters, flat_value, _LAST_ROUNDS))
+        for fit in own[:2]:
+            if fit.gain > 0.6 * best:
+                last.append(
+                    _climb(patch, sign, fit.corner, fit.parameters, flat_value, _LAST_ROUNDS)
+                )
     found = [fit for fit in last if fit is not None]
     return max(found, key=lambda fit: fit.gain) if found else None
 
@@ -107,7 +113,7 @@ def _prior(parameters: FloatArray) -> tuple[float, FloatArray, FloatArray]:
 
 
 def _climb(
-    patch: Patch, sign: float, start: FloatArray, flat_value: float, rounds: int
+    patch: Patch, sign: float, corner: float, start: FloatArray, flat_value: float, rounds: int
 ) -> BumpFit | None:
     """Climb the posterior from `start` by damped Fisher scoring."""
     ground_far = np.sqrt(
@@ -122,7 +128,7 @@ def _climb(
              HIGHLIGHT_CAP, patch.weight)  # fmt: skip
     at = start.copy()
     damping = 1e-2
-    value, gradient, information = fisher_step(at, sign, patch.ratio, *fixed)
+    value, gradient, information = fisher_step(at, sign, corner, patch.ratio, *fixed)
     prior_value, prior_gradient, prior_information = _prior(at)
     for _ in range(rounds):
         whole = information + prior_information
@@ -137,12 +143,12 @@ def _climb(
         )
         trial = at + step
         trial[5] = np.clip(trial[5], *_SHAPE_BOUNDS)
-        trial_value = log_likelihood(trial, sign, patch.ratio, *fixed)
+        trial_value = log_likelihood(trial, sign, corner, patch.ratio, *fixed)
         trial_prior = _prior(trial)
         rise = trial_value + trial_prior[0] - value - prior_value
         if rise > 0:
             at, damping = trial, max(damping * 0.3, 1e-4)
-            value, gradient, information = fisher_step(at, sign, patch.ratio, *fixed)
+            value, gradient, information = fisher_step(at, sign, corner, patch.ratio, *fixed)
             prior_value, prior_gradient, prior_information = trial_prior
             if rise < 0.02:
                 break
@@ -153,4 +159,4 @@ def _climb(
     covariance = np.linalg.pinv(information + prior_information)
     if not np.all(np.isfinite(covariance)) or not np.all(np.isfinite(at)):
         return None
-    return BumpFit(at, covariance, sign, float(value + prior_value - flat_value))
+    return BumpFit(at, covariance, sign, corner, float(value + prior_value - flat_value))

@@ -305,38 +305,28 @@ def _patch(
 
 def _starts(
     shadow: _Shadow, start_m: float, end_m: float, drop: float, track: Track
-) -> list[tuple[float, FloatArray]]:
+) -> list[tuple[float, float, FloatArray]]:
     """Return starting points of the fit: a bump and a pit, smooth and steep."""
     y0, half = _along_extent(shadow, track)
     x_start, x_end = (float(ground_range(np.array(v), np.array(drop))) for v in (start_m, end_m))
     high = float(hill_height(end_m - start_m, start_m, drop))
     deep = float(crater_depth(end_m - start_m, start_m, drop))
     middle = 0.5 * (x_start + x_end)
-    # Sign, beta, size against the shadow's half width along the track, centre, height.
+    # Sign, outline, beta, size against the shadow's half width along the track, centre, height.
     guesses = (
-        (1.0, 1.0, 0.8, x_start - 0.4 * half, high),
-        (1.0, 2.0, 0.65, x_start, high),
-        (1.0, 5.0, 1.0, x_start - 0.9 * half, high),
-        (-1.0, 1.0, 0.9, x_start + half, 1.2 * deep),
-        (-1.0, 3.0, 1.0, max(middle, x_start + 0.8 * half), 1.2 * deep),
+        (1.0, 2.0, 1.0, 0.8, x_start - 0.4 * half, high),
+        (1.0, 2.0, 2.0, 0.65, x_start, high),
+        (1.0, 2.0, 5.0, 1.0, x_start - 0.9 * half, high),
+        (1.0, 6.0, 5.0, 0.9, x_start - 0.8 * half, high),
+        (-1.0, 2.0, 1.0, 0.9, x_start + half, 1.2 * deep),
+        (-1.0, 2.0, 3.0, 1.0, max(middle, x_start + 0.8 * half), 1.2 * deep),
     )
+    law = np.log(1.8)
     return [
-        (
-            sign,
-            np.array(
-                [
-                    x0,
-                    y0,
-                    np.log(a),
-                    np.log(size * half),
-                    np.log(size * half),
-                    np.log(beta),
-                    np.log(1.8),
-                ]
-            ),
-        )
-        for sign, beta, size, x0, a in guesses
-    ]
+        (sign, corner,
+         np.array([x0, y0, np.log(a), np.log(size * half), np.log(size * half), np.log(beta), law]))
+        for sign, corner, beta, size, x0, a in guesses
+    ]  # fmt: skip
 
 
 def _along_extent(shadow: _Shadow, track: Track) -> tuple[float, float]:

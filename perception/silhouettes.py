@@ -22,13 +22,14 @@ LEAST_MEAN = 0.15
 
 
 @njit(cache=True)
-def predict(parameters, sign, drop_m, along_m, start_m, step_m, leak, facet_m, out):  # type: ignore[no-untyped-def]
+def predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, out):  # type: ignore[no-untyped-def]
     """Fill `out` (n, m) with the mean echo per slant bin, 1 where the flat floor shows.
 
     Parameters
     ----------
     parameters : (7,) x0, y0, log|A|, log sx, log sy, log beta, log kappa (metres; x is ground range).
     sign : 1 hill, -1 crater.
+    corner : exponent of the footprint's outline: 2 an ellipse, 6 a rectangle with rounded corners.
     drop_m, along_m : (n,) height of the sonar above the floor and place along the track, per ping.
     start_m, step_m : near edge of the first bin, width of a bin, slant.
     leak : level inside shadows.
@@ -40,22 +41,35 @@ def predict(parameters, sign, drop_m, along_m, start_m, step_m, leak, facet_m, o
     sx, sy, beta = np.exp(parameters[3]), np.exp(parameters[4]), np.exp(parameters[5])
     kappa = np.exp(parameters[6])
     # The bump ends where it is 1/500 of its height; outside only its shadow remains.
-    q_end = 12.4 ** (1.0 / beta)
+    q_end = 12.4 ** (0.5 * corner / beta)
     for i in range(n):
         drop = drop_m[i]
-        dy = ((along_m[i] - y0) / sy) ** 2
+        dy = abs((along_m[i] - y0) / sy) ** corner
         for k in range(m):
             out[i, k] = 0.0
         x_low = x_high = 1e9
         if dy < q_end:
-            half = sx * (q_end - dy) ** 0.5
+            half = sx * (q_end - dy) ** (1.0 / corner)
             x_low, x_high = max(x0 - half, 0.02 * drop), x0 + half
         if x_high <= x_low or x_low >= 1e8:
             for k in range(m):
                 out[i, k] = 1.0 + leak
             continue
         resume = _trace(
-            out[i], x_low, x_high, dy, x0, sx, height, beta, kappa, drop, start_m, step_m, facet_m
+            out[i],
+            x_low,
+            x_high,
+            dy,
+            x0,
+            sx,
+            height,
+            beta,
+            corner,
+            kappa,
+            drop,
+            start_m,
+            step_m,
+            facet_m,
         )
         r_low, r_resume = (
             (x_low * x_low + drop * drop) ** 0.5,
@@ -73,18 +87,20 @@ def predict(parameters, sign, drop_m, along_m, start_m, step_m, leak, facet_m, o
 
 
 @njit(cache=True)
-def _trace(row, x_low, x_high, dy, x0, sx, height, beta, kappa, drop, start_m, step_m, facet_m):  # type: ignore[no-untyped-def]
+def _trace(
+    row, x_low, x_high, dy, x0, sx, height, beta, corner, kappa, drop, start_m, step_m, facet_m
+):  # type: ignore[no-untyped-def]
     """Sum the lit facets of one line into `row`; return the ground range where the flat floor is lit again."""
     count = min(max(int((x_high - x_low) / facet_m) + 1, 16), 600)
     dx = (x_high - x_low) / count
-    x_before, z_before = x_low, _height(x_low, dy, x0, sx, height, beta)
+    x_before, z_before = x_low, _height(x_low, dy, x0, sx, height, beta, corner)
     r_before = (x_before * x_before + (drop - z_before) ** 2) ** 0.5
     # Tangent of the elevation angle; the largest so far hides all below it.
     horizon = min((z_before - drop) / x_before, -drop / x_before)
     over_before = 0.0
     for j in range(1, count + 1):
         x = x_low + j * dx
-        z = _height(x, dy, x0, sx, height, beta)
+        z = _height(x, dy, x0, sx, height, beta, corner)
         r = (x * x + (drop - z) ** 2) ** 0.5
         tangent = (z - drop) / x
         over = tangent - horizon
@@ -109,8 +125,11 @@ def _trace(row, x_low, x_high, dy, x0, sx, height, beta, kappa, drop, start_m, s
 
 
 @njit(cache=True)
-def _height(x, dy, x0, sx, height, beta):  # type: ignore[no-untyped-def]
-    q = ((x - x0) / sx) ** 2 + dy
+def _height(x, dy, x0, sx, height, beta, corner):  # type: ignore[no-untyped-def]
+    if corner == 2.0:
+        q = ((x - x0) / sx) ** 2 + dy
+    else:
+        q = (abs((x - x0) / sx) ** corner + dy) ** (2.0 / corner)
     if q <= 1e-12:
         return height
     power = q**beta
@@ -151,7 +170,7 @@ def _soft(mean, cap):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def fisher_step(
-    parameters, sign, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
+    parameters, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
 ):  # type: ignore[no-untyped-def]
     """Return the log likelihood, its gradient (7,) and Fisher information (7, 7) of one patch.
 
@@ -161,14 +180,14 @@ def fisher_step(
     """
     n, m = ratio.shape
     base = np.empty((n, m))
-    predict(parameters, sign, drop_m, along_m, start_m, step_m, leak, facet_m, base)
+    predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, base)
     slopes = np.empty((N_PARAMETERS, n, m))
     moved = parameters.copy()
     for p in range(N_PARAMETERS):
         # Half a facet of position, or 2 % of a logarithm: smooth over the facets' own steps.
         h = 0.5 * facet_m if p < 2 else 0.02
         moved[p] = parameters[p] + h
-        predict(moved, sign, drop_m, along_m, start_m, step_m, leak, facet_m, slopes[p])
+        predict(moved, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, slopes[p])
         moved[p] = parameters[p]
         for i in range(n):
             for k in range(m):
@@ -207,12 +226,12 @@ def fisher_step(
 
 @njit(cache=True)
 def log_likelihood(
-    parameters, sign, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
+    parameters, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
 ):  # type: ignore[no-untyped-def]
     """Return the log likelihood of one patch, as `fisher_step` has it."""
     n, m = ratio.shape
     base = np.empty((n, m))
-    predict(parameters, sign, drop_m, along_m, start_m, step_m, leak, facet_m, base)
+    predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, base)
     value = 0.0
     for i in range(n):
         for k in range(m):

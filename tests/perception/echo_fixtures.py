@@ -62,23 +62,37 @@ def boulder(radius_m: float, x0: float, y0: float) -> Height:
 
 def echo_power(height: Height, y: float, altitude_m: float, side: int, s: Survey) -> FloatArray:
     """Return the mean echo power per slant bin of one side of one ping; `side` is -1 or 1."""
-    step = s.sample_m / 4
+    step = s.sample_m / 3
     x = (np.arange(int(s.sample_m * s.n_samples / step)) + 0.5) * step
-    z = height(side * x, np.full_like(x, y))
+    x, z = _polyline(x, height(side * x, np.full_like(x, y)), step)
     drop = altitude_m - z
-    slant = np.hypot(x, drop)
     angle = np.arctan2(-drop, x)
     seen = angle >= np.maximum.accumulate(angle) - 1e-12
-    rise = np.gradient(z, step)
-    # Cosine of the incidence: the ray back to the sonar against the surface's normal.
-    cosine = np.clip((drop + x * rise) / (slant * np.hypot(1, rise)), 0, None)
-    energy = np.where(seen, cosine**s.lambert * np.hypot(1, rise) * step, 0.0)
-    # Vertical faces that fall between two columns: the wall's facets echo between both ranges.
+    # Facets between neighbouring points; lit where both ends are.
+    dx, dz = np.diff(x), np.diff(z)
+    xm, dm = 0.5 * (x[1:] + x[:-1]), 0.5 * (drop[1:] + drop[:-1])
+    length, slant = np.hypot(dx, dz), np.hypot(xm, dm)
+    cosine = np.clip((dm * dx + xm * dz) / (length * slant + 1e-12), 0, None)
+    energy = np.where(seen[1:] & seen[:-1], cosine**s.lambert * length, 0.0)
     bins = np.zeros(s.n_samples)
     index = (slant / s.sample_m).astype(int)
     inside = index < s.n_samples
     np.add.at(bins, index[inside], energy[inside])
     return bins
+
+
+def _polyline(x: FloatArray, z: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+    """Fill steep rises between two columns with points, so that a wall is made of small facets too."""
+    extra = np.minimum(np.abs(np.diff(z)) / step, 200).astype(int)
+    if not extra.any():
+        return x, z
+    counts = np.append(extra + 1, 1)
+    start = np.repeat(np.arange(len(x)), counts)
+    part = (np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)) / np.repeat(
+        counts, counts
+    )
+    ahead = np.minimum(start + 1, len(x) - 1)
+    return x[start] + part * (x[ahead] - x[start]), z[start] + part * (z[ahead] - z[start])
 
 
 def make_swath(height: Height, survey: Survey, rng: np.random.Generator) -> Swath:
