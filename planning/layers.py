@@ -45,7 +45,11 @@ class LayeredPath:
 
 
 def layered_path(
-    surface: Surface, start: tuple[float, float], goal: tuple[float, float], soft: bool = False
+    surface: Surface,
+    start: tuple[float, float],
+    goal: tuple[float, float],
+    soft: bool = False,
+    nodes: int = _NODES,
 ) -> LayeredPath:
     """Search for a path that keeps pitch and ceiling, on a thinned map.
 
@@ -54,8 +58,9 @@ def layered_path(
     start, goal : local coordinates.
     soft : allow breaches of ceiling at a price that only a path without alternative pays: the
         place where it pays is the place that blocks.
+    nodes : of the thinned map, about.
     """
-    thin = thinned(surface)
+    thin = thinned(surface, nodes)
     a, b = thin.node(start), thin.node(goal)
     thin.barred[a] = thin.barred[b] = False
     to_go = cost_to_go(thin, b)
@@ -75,12 +80,12 @@ def layered_path(
     )  # fmt: skip
     if len(states) == 0:
         return LayeredPath(np.zeros((0, 2)), math.inf, np.zeros(0))
-    nodes, levels = states[:, :2], states[:, 2]
-    points = np.column_stack([nodes[:, 1] * thin.cell_m[0], nodes[:, 0] * thin.cell_m[1]])
+    at, levels = states[:, :2], states[:, 2]
+    points = np.column_stack([at[:, 1] * thin.cell_m[0], at[:, 0] * thin.cell_m[1]])
     points += thin.shift_m
     points[0], points[-1] = start, goal
-    height = thin.lower[nodes[:, 0], nodes[:, 1]] + levels * level
-    excess = np.maximum(0.0, height - thin.upper[nodes[:, 0], nodes[:, 1]])
+    height = thin.lower[at[:, 0], at[:, 1]] + levels * level
+    excess = np.maximum(0.0, height - thin.upper[at[:, 0], at[:, 1]])
     return LayeredPath(points, float(cost), excess)
 
 
@@ -106,10 +111,10 @@ class Thin:
         return min(max(row, 0), rows - 1), min(max(col, 0), cols - 1)
 
 
-def thinned(surface: Surface) -> Thin:
-    """Return the map thinned to about `_NODES` nodes: means of blocks, barred if half is."""
+def thinned(surface: Surface, nodes: int = _NODES) -> Thin:
+    """Return the map thinned to about so many nodes: means of blocks, barred if half is."""
     rows, cols = surface.shape
-    block = max(1, math.ceil(math.sqrt(rows * cols / _NODES)))
+    block = max(1, math.ceil(math.sqrt(rows * cols / nodes)))
     lower = _blocks(np.maximum(surface.stack[..., LOWER], surface.bottom_most_m), block)
     bottom = _blocks(surface.stack[..., BOTTOM], block)
     weight = _blocks(surface.stack[..., WEIGHT], block)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import dataclass, field
 
@@ -13,6 +14,7 @@ from planning.bound import lower_bound
 from planning.corridor import make_corridor
 from planning.cost import CostTerms
 from planning.curve import waypoints
+from planning.failure import Blockage, explain_barrier, explain_limits
 from planning.field import search
 from planning.finish import exact_cost, finish
 from planning.layers import cost_to_go, layered_path, thinned
@@ -20,7 +22,7 @@ from planning.limits import VehicleLimits
 from planning.polish import RADIUS_RESERVE, Candidate, control_spacing, polish, smooth_guide
 from planning.risk import clearance_factor, clearance_sigma, patches_crossed
 from planning.route import Route, route_of
-from planning.surface import Surface, build_surface
+from planning.surface import Surface, build_surface, cautious
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +74,7 @@ class Plan:
     grid_path: FloatArray
     stages_s: dict[str, float] = field(default_factory=dict)
     costs: dict[str, float] = field(default_factory=dict)
-    blocked_at: tuple[float, float] | None = None
+    blockage: Blockage | None = None
 
     @property
     def solved(self) -> bool:
@@ -164,9 +166,10 @@ def _plan_on(
     lap("bound_s")
     ends = np.array([surface.local(np.array(p[0]), np.array(p[1])) for p in (start, goal)])
     if not np.isfinite(grid_cost):
+        parted = explain_barrier(surface, node_a, node_b)
         return Plan(
-            None, "no way: barred ground parts start and goal", float("nan"), bound, k, patches,
-            surface, np.zeros((0, 2)), stages,
+            None, parted.reason, math.nan, bound, k, patches, surface, np.zeros((0, 2)), stages,
+            blockage=parted,
         )  # fmt: skip
     nodes = field_.path(*node_b)
     guide = np.column_stack([nodes[:, 1] * surface.cell_m[0], nodes[:, 0] * surface.cell_m[1]])
@@ -186,11 +189,19 @@ def _plan_on(
         if found is not None:
             candidates.append(_polished(surface, found, "ompl"))
         lap("polish_s")
-    costs = {c.source: c.cost for c in candidates}
-    route, problem, where = _best_proved(surface, candidates, grid.crs)
+    route, problem = _best_proved(surface, candidates, grid.crs)
+    if route is None:
+        candidates += _second_tries(surface, candidates, ends)
+        route, problem = _best_proved(surface, candidates, grid.crs)
     lap("proof_s")
+    costs = {c.source: c.cost for c in candidates}
+    blocked: Blockage | None = None
+    if route is None:
+        blocked = explain_limits(surface, candidates, guide, problem)
+        lap("explain_s")
     return Plan(
-        route, problem, grid_cost, bound, k, patches, surface, guide, stages, costs, where
+        route, "" if blocked is None else blocked.reason, grid_cost, bound, k, patches, surface,
+        guide, stages, costs, blocked,
     )  # fmt: skip
 
 
@@ -226,18 +237,51 @@ def _ompl(
     return None if found is None else corridor.polyline(found.states)
 
 
+# Height in reserve, and samples per cell, of a second polish for what the proof refused.
+_CAUTION_M, _CAUTION_FINENESS = 0.25, 2.0
+
+
+def _second_tries(
+    surface: Surface, candidates: list[Candidate], ends: FloatArray
+) -> list[Candidate]:
+    """Try harder before giving up: finer polish with more in reserve, from three guides.
+
+    A route can fail the proof by centimetres between samples, and a guide that breaks a limit can
+    lie a bend away from one that does not.
+    """
+    best = min(candidates, key=_merit).points
+    guides = [best]
+    for nodes, soft in ((250_000, False), (62_500, True)):
+        layered = layered_path(surface, tuple(ends[0]), tuple(ends[1]), soft=soft, nodes=nodes)
+        if len(layered.points) > 2:
+            length = float(np.hypot(*np.diff(layered.points, axis=0).T).sum())
+            spacing = control_spacing(surface, length) / _CAUTION_FINENESS
+            guides.append(smooth_guide(layered.points, spacing))
+    tries = []
+    for i, guide in enumerate(guides):
+        careful = cautious(surface, ends) if surface.barred.any() else surface
+        tried = polish(careful, guide, source=f"wide {i}", reserve_m=_CAUTION_M)
+        if tried.breach > 0:
+            tried = polish(
+                surface, guide, source=f"fine {i}", reserve_m=_CAUTION_M, fineness=_CAUTION_FINENESS
+            )
+        tries.append(tried)
+        if tried.breach == 0:
+            break
+    return tries
+
+
 def _best_proved(
     surface: Surface, candidates: list[Candidate], crs: str
-) -> tuple[Route | None, str, tuple[float, float] | None]:
+) -> tuple[Route | None, str]:
     """Return the cheapest candidate that passes the proof, or what broke the best of them."""
-    problem, where = "", None
+    problem = ""
     for candidate in sorted(candidates, key=_merit):
         w = finish(surface, candidate.points)
         if not w.problem:
-            return route_of(w, exact_cost(surface, w), crs), "", None
-        if not problem:
-            problem, where = w.problem, (w.worst[0], w.worst[1])
-    return None, problem, where
+            return route_of(w, exact_cost(surface, w), crs), ""
+        problem = problem or w.problem
+    return None, problem
 
 
 def end_node(surface: Surface, end: tuple[float, float], name: str) -> tuple[int, int]:

@@ -46,7 +46,7 @@ class Candidate:
     source: str = ""
 
 
-def rules_of(surface: Surface) -> FloatArray:
+def rules_of(surface: Surface, reserve_m: float = HEIGHT_RESERVE_M) -> FloatArray:
     """Return the rules of `path_cost` for a surface's limits and terms."""
     limits = surface.limits
     return np.array(
@@ -58,7 +58,7 @@ def rules_of(surface: Surface) -> FloatArray:
             limits.ceiling_m,
             surface.bottom_most_m,
             surface.top_m,
-            HEIGHT_RESERVE_M,
+            reserve_m,
         ]
     )
 
@@ -91,18 +91,31 @@ def smooth_guide(points: FloatArray, spacing: float) -> FloatArray:
     return respace(fine, spacing)
 
 
-def evaluate(surface: Surface, points: FloatArray, source: str = "") -> Candidate:
-    """Cost a control polygon as it stands."""
+def evaluate(
+    surface: Surface,
+    points: FloatArray,
+    source: str = "",
+    step: float | None = None,
+    rules: FloatArray | None = None,
+) -> Candidate:
+    """Cost a control polygon as it stands, sampled `step` apart (a cell without)."""
+    step = min(surface.cell_m) if step is None else step
     cost, breach = _whole_cost(
         surface.stack, surface.cell_m[0], surface.cell_m[1], points,
-        surface.limits.turn_radius_m * RADIUS_RESERVE, min(surface.cell_m), rules_of(surface),
-        *_scratch(surface, points),
+        surface.limits.turn_radius_m * RADIUS_RESERVE, step,
+        rules_of(surface) if rules is None else rules, *_scratch(points, step),
     )  # fmt: skip
     return Candidate(points, float(cost), float(breach), source)
 
 
 def polish(
-    surface: Surface, points: FloatArray, sweeps: int = 60, rounds: int = 3, source: str = ""
+    surface: Surface,
+    points: FloatArray,
+    sweeps: int = 60,
+    rounds: int = 3,
+    source: str = "",
+    reserve_m: float = HEIGHT_RESERVE_M,
+    fineness: float = 1.0,
 ) -> Candidate:
     """Lower the cost of a control polygon until it stops falling; ends stay.
 
@@ -111,22 +124,42 @@ def polish(
     points : (n, 2) control polygon in local coordinates.
     sweeps : most passes over all bumps in a round.
     rounds : after each but the last the control points are spaced evenly again.
+    reserve_m : height kept in reserve at floor and ceiling.
+    fineness : samples per cell, and control points per usual control point.
     """
-    spacing = control_spacing(surface, float(np.hypot(*np.diff(points, axis=0).T).sum()))
-    best = evaluate(surface, points, source)
-    points = points.copy()
+    spacing = control_spacing(surface, float(np.hypot(*np.diff(points, axis=0).T).sum())) / fineness
+    step = min(surface.cell_m) / fineness
+    rules = rules_of(surface, reserve_m)
+    points, locked = _lock_ends(surface, points.copy())
+    best = evaluate(surface, points.copy(), source, step, rules)
     for turn in range(rounds):
         if turn > 0:
-            points = respace(points, spacing)
+            points, locked = _lock_ends(surface, respace(points, spacing))
         _descend(
-            surface.stack, surface.cell_m[0], surface.cell_m[1], points,
-            surface.limits.turn_radius_m * RADIUS_RESERVE, min(surface.cell_m), rules_of(surface),
-            *_scratch(surface, points), sweeps, _margin_m(surface),
+            surface.stack, surface.cell_m[0], surface.cell_m[1], points, *locked,
+            surface.limits.turn_radius_m * RADIUS_RESERVE, step, rules,
+            *_scratch(points, step), sweeps, _margin_m(surface),
         )  # fmt: skip
-        found = evaluate(surface, points.copy(), source)
+        found = evaluate(surface, points.copy(), source, step, rules)
         if found.cost < best.cost or (best.breach > 0 and found.breach == 0):
             best = found
     return best
+
+
+def _lock_ends(surface: Surface, points: FloatArray) -> tuple[FloatArray, tuple[int, int]]:
+    """Lay the end legs along the headings asked for; return how many points stay at either end."""
+    locked = [1, 1]
+    limits = surface.limits
+    for i, heading_deg in enumerate((limits.start_heading_deg, limits.goal_heading_deg)):
+        if not math.isfinite(heading_deg) or len(points) < 4:
+            continue
+        heading = math.radians(heading_deg)
+        ahead = np.array([math.sin(heading), -math.cos(heading)]) * (1 if i == 0 else -1)
+        end, beside = (0, 1) if i == 0 else (-1, -2)
+        leg = float(np.hypot(*(points[beside] - points[end])))
+        points[beside] = points[end] + leg * ahead
+        locked[i] = 2
+    return points, (locked[0], locked[1])
 
 
 def _margin_m(surface: Surface) -> float:
@@ -136,10 +169,10 @@ def _margin_m(surface: Surface) -> float:
     return min(band / slope, 12.0 * band) + 4.0 * max(surface.cell_m)
 
 
-def _scratch(surface: Surface, points: FloatArray) -> tuple[FloatArray, ...]:
+def _scratch(points: FloatArray, step: float) -> tuple[FloatArray, ...]:
     length = float(np.hypot(*np.diff(points, axis=0).T).sum())
     # A path may grow while it is moved; twice its samples leaves room, and what does not fit is refused.
-    n = int(2.0 * length / min(surface.cell_m)) + 4 * len(points) + 256
+    n = int(2.0 * length / step) + 4 * len(points) + 256
     work, hull = make_work(n)
     return np.empty(n), np.empty(n), work, hull
 
@@ -165,7 +198,23 @@ def _window_cost(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _descend(stack, width, height, points, radius, step, rules, px, py, work, hull, sweeps, margin):  # type: ignore[no-untyped-def]
+def _descend(  # type: ignore[no-untyped-def]
+    stack,
+    width,
+    height,
+    points,
+    head,
+    tail,
+    radius,
+    step,
+    rules,
+    px,
+    py,
+    work,
+    hull,
+    sweeps,
+    margin,
+):
     n = len(points)
     if n < 3:
         return
@@ -185,14 +234,15 @@ def _descend(stack, width, height, points, radius, step, rules, px, py, work, hu
             if half > 1 and half > n // 2:
                 continue
             stride = max(1, half // 2)
-            for centre in range(1 + sweep % stride, n - 1, stride):
+            for centre in range(head + sweep % stride, n - tail, stride):
                 d = delta[level, centre]
                 if d < finest:
                     # Rested; look again now and then, since its neighbours move.
                     if sweep % 4 != 3:
                         continue
                     d = 4.0 * finest
-                j0, j1 = max(1, centre - half + 1), min(n - 2, centre + half - 1)
+                j0 = max(head, centre - half + 1)
+                j1 = min(n - 1 - tail, centre + half - 1)
                 first, last = max(0, j0 - 1 - beyond), min(n - 1, j1 + 1 + beyond)
                 old = _window_cost(
                     stack,
@@ -213,6 +263,9 @@ def _descend(stack, width, height, points, radius, step, rules, px, py, work, hu
                 ty = points[centre + 1, 1] - points[centre - 1, 1]
                 norm = max(math.hypot(tx, ty), 1e-9)
                 nx, ny = -ty / norm, tx / norm
+                if half <= 2 and sweep % 3 == 2:
+                    # Along the path too: room for an arc is gained by shifting its corner.
+                    nx, ny = tx / norm, ty / norm
                 for j in range(j0, j1 + 1):
                     saved[j, 0], saved[j, 1] = points[j, 0], points[j, 1]
                 better = False

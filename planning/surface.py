@@ -6,7 +6,7 @@ that column = x / width and row = y / height.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -139,3 +139,24 @@ def _stack(
         stack[..., BOTTOM] = bottom[rows, cols]
     stack[..., BAR] = ndimage.distance_transform_edt(barred, sampling=(cell_m[1], cell_m[0]))
     return stack
+
+
+def cautious(surface: Surface, ends: FloatArray) -> Surface:
+    """Return the surface with barred ground one cell wider, but for the surroundings of the ends.
+
+    Samples a cell apart can miss the corner of a barred square; with this margin they cannot.
+
+    Parameters
+    ----------
+    ends : (n, 2) local coordinates that must stay free.
+    """
+    wide = ndimage.binary_dilation(surface.barred, np.ones((3, 3), bool))
+    for x, y in ends:
+        r, c = round(float(y) / surface.cell_m[1]), round(float(x) / surface.cell_m[0])
+        near = (slice(max(0, r - 2), r + 3), slice(max(0, c - 2), c + 3))
+        wide[near] = surface.barred[near]
+    stack = surface.stack.copy()
+    stack[..., BAR] = ndimage.distance_transform_edt(
+        wide, sampling=(surface.cell_m[1], surface.cell_m[0])
+    )
+    return replace(surface, stack=stack)
