@@ -43,7 +43,7 @@ def near_end_evidence(rows: Iterable[FloatArray], hint_fraction: Iterable[float]
     if not judged:
         return 0.0
     levels = np.array([level for level, _ in judged])
-    gains = _greatest_step(levels)[0] - _greatest_step(levels[:, ::-1])[0]
+    gains = _rises(levels).max(axis=1) - _rises(levels[:, ::-1]).max(axis=1)
     evidence = float(np.median(gains))
     agreeing = float(np.mean(np.sign(gains) == np.sign(evidence)))
     if abs(evidence) >= _SURE and agreeing >= 0.7:
@@ -67,7 +67,10 @@ def first_return_fractions(rows: Iterable[FloatArray]) -> FloatArray:
     out = np.full(len(levels), np.nan)
     known = [i for i, level in enumerate(levels) if level is not None]
     if known:
-        step, at = _greatest_step(np.array([levels[i] for i in known]), after=2)
+        rises = _rises(np.array([levels[i] for i in known]), after=2)
+        step = rises.max(axis=1)
+        # The first rise that is most of the greatest: speckle puts the greatest some blocks later.
+        at = (rises > 0.6 * step[:, None]).argmax(axis=1) + _SKIP + 2.0
         out[known] = np.where(step > _SURE, at / _BLOCKS, np.nan)
     return out
 
@@ -86,18 +89,14 @@ def _block_levels(row: FloatArray) -> FloatArray | None:
     return np.asarray(np.log(blocks + 1e-3 * mean))
 
 
-def _greatest_step(levels: FloatArray, after: int = _AFTER) -> tuple[FloatArray, FloatArray]:
-    """Return the greatest rise (n,) from the upper quartile of all before to the mean just after.
-
-    Also the block (n,) where it is.
-    """
+def _rises(levels: FloatArray, after: int = _AFTER) -> FloatArray:
+    """Return the rise (n, candidates) from the upper quartile of all before to the mean just after."""
     rises = np.empty((len(levels), _DEEPEST - _SKIP - 2))
     for column, at in enumerate(range(_SKIP + 2, _DEEPEST)):
         rank = (at - _SKIP) * 3 // 4
         before = np.partition(levels[:, _SKIP:at], rank, axis=1)[:, rank]
         rises[:, column] = levels[:, at : at + after].mean(axis=1) - before
-    best = rises.argmax(axis=1)
-    return np.maximum(rises.max(axis=1), 0.0), best + _SKIP + 2.0
+    return rises
 
 
 def _step_at(level: FloatArray, at: int) -> float:
