@@ -337,7 +337,25 @@ def load_scenario(source: Path | str) -> Scenario:
         path = named[str(source)]
     if not path.exists() and not path.suffix and path.parent == Path():
         raise InputError(f"{path}: no such scenario; there are {', '.join(named)}, or give a file")
-    return scenario_of(read_toml(path), str(path))
+    return scenario_of(rasters_from(read_toml(path), path.parent), str(path))
+
+
+def rasters_from(tree: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a tree whose `raster` components name their file from the root, not from `folder`.
+
+    A resolved scenario is copied into other folders, where a relative path would lead nowhere.
+    """
+    world = tree.get("world")
+    parts = world.get("terrain") if isinstance(world, dict) else None
+    if not isinstance(world, dict) or not isinstance(parts, list):
+        return tree
+
+    def absolute(part: Any) -> Any:
+        if isinstance(part, dict) and isinstance(part.get("path"), str):
+            return {**part, "path": str((folder / part["path"]).resolve())}
+        return part
+
+    return {**tree, "world": {**world, "terrain": [absolute(part) for part in parts]}}
 
 
 def scenario_of(tree: Mapping[str, Any], source: str) -> Scenario:

@@ -31,14 +31,15 @@ def command(scenario: str, out: Path, seed: int | None, quiet: bool, verbose: bo
     set_verbosity(quiet, verbose)
     from scenarios.outputs import write_metrics
     from scenarios.schema import load_scenario, tree_of
-    from scenarios.simulation import simulate, summary, write_simulation
+    from scenarios.simulation import simulate, summary
+    from scenarios.simulation_files import write_simulation
 
     config = load_scenario(scenario)
     if seed is not None:
         config = config.model_copy(update={"seed": seed})
     prepare_out(out)
     with progress_bars(quiet) as progress:
-        simulation = simulate(config, folder=Path(scenario).parent, progress=progress)
+        simulation = simulate(config, progress)
         write_simulation(simulation, out, progress)
     metrics = summary(simulation)
     write_metrics(out, metrics, tree_of(config), seed=config.seed)

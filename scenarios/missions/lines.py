@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from perception.records import FloatArray
-from scenarios.schema import Block, MissionSection
+from perception.records import FloatArray, InputError
+from scenarios.schema import Block, MissionSection, WorldSection
 
 Line = tuple[float, float, float, float]
 
@@ -36,6 +36,25 @@ def _block_lines(block: Block) -> list[Line]:
             ends = (ends[1], ends[0])
         lines.append((*map(float, ends[0]), *map(float, ends[1])))  # type: ignore[arg-type]
     return lines
+
+
+def refuse_outside(lines: Sequence[Line], world: WorldSection) -> None:
+    """Refuse lines that leave the world, before it is built.
+
+    Raises
+    ------
+    InputError
+        Names the size that the lines need.
+    """
+    ends = np.abs(np.reshape(lines, (-1, 2))).max(axis=0)
+    for axis, reach, size in zip(
+        ("east", "north"), ends, (world.size_east_m, world.size_north_m), strict=True
+    ):
+        if reach > 0.5 * size:
+            raise InputError(
+                f"world.size_{axis}_m = {size:g}: a line ends {reach:.0f} m {axis} of the world's "
+                f"middle; give at least {2 * reach:.0f}, and room for the turns"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,6 @@
 """`bathynav simulate`: every named scenario held to one contract, in a small size."""
 
 import csv
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from numpy.testing import assert_allclose
 
 from mapping.fixes import read_fixes
 from mapping.rasters import read_map
+from scenarios.commands import main
 from scenarios.commands.simulate import command
 from scenarios.schema import library, load_scenario, scenario_of, tree_of
 from scenarios.simulation import simulate
@@ -173,18 +173,24 @@ def test_surveys_own_track_may_be_the_one_to_locate():
     assert made.nav.truth.time_s[0] == made.survey.truth.time_s[0]
 
 
-def run(*arguments):
-    return subprocess.run(
-        [sys.executable, "-c", "from scenarios.commands import main; main()", *arguments],
-        capture_output=True, text=True, cwd=Path(__file__).resolve().parents[2], check=False,
-    )  # fmt: skip
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Call the command line as a shell would: exit status and both streams."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["bathynav", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, *capsys.readouterr()
+
+    return call
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("seed = 1\n[world]\ndpeth = 3\n[mission]\nlines = [[0,0,9,0]]", "world.dpeth = 3"),
-        ("[mission]\nlines = [[0,0,9999,0]]", "the track leaves the world"),
+        ("[mission]\nlines = [[0,0,9999,0]]", "a line ends 9999 m east"),
         ("[mission]\nlines = [[0,0,9,0]]\nstart = 'now'", "mission.start = 'now'"),
         ("[world]\ncrs = 'EPSG:4326'\n[mission]\nlines = [[0,0,9,0]]", "not a projected CRS"),
         (
@@ -194,17 +200,53 @@ def run(*arguments):
         ("\x00\x01", "TOML"),
     ],
 )
-def test_a_bad_scenario_fails_with_one_line_and_writes_nothing(text, words, tmp_path):
+def test_a_bad_scenario_fails_with_one_line_and_writes_nothing(text, words, tmp_path, run):
     path = tmp_path / "bad.toml"
     path.write_text(text)
-    result = run("simulate", str(path), "--out", str(tmp_path / "out"))
-    assert result.returncode == 1
-    assert words in result.stderr and len(result.stderr.strip().splitlines()) == 1
+    status, _, complaint = run("simulate", str(path), "--out", str(tmp_path / "out"))
+    assert status == 1
+    assert words in complaint and len(complaint.strip().splitlines()) == 1
     assert not [p for p in (tmp_path / "out").rglob("*") if p.is_file()]
 
 
-def test_the_scenarios_command_lists_the_library():
-    result = run("scenarios")
-    assert result.returncode == 0
-    assert [line.split()[0] for line in result.stdout.splitlines()] == list(library())
-    assert 'name = "demo"' in run("scenarios", "demo").stdout
+def test_the_scenarios_command_lists_the_library(run):
+    status, listed, _ = run("scenarios")
+    assert status == 0
+    assert [line.split()[0] for line in listed.splitlines()] == list(library())
+    assert 'name = "demo"' in run("scenarios", "demo")[1]
+
+
+def test_an_output_folder_that_cannot_be_written_is_told(tmp_path, run):
+    (tmp_path / "file").write_text("")
+    status, _, complaint = run("simulate", "demo", "--out", str(tmp_path / "file"))
+    assert status == 1 and "cannot be used as output folder" in complaint
+
+
+def test_a_raster_is_found_from_the_scenario_s_own_folder(tmp_path):
+    from mapping.rasters import write_map
+    from perception.records import Grid
+
+    rng = np.random.default_rng(0)
+    heights = np.cumsum(rng.normal(0, 0.1, (60, 60)), axis=0)
+    write_map(tmp_path / "bank.tif", Grid(heights, 500000.0, 5000000.0, 5.0, crs="EPSG:32631"))
+    part = {"kind": "raster", "path": "bank.tif", "rms_m": 2.0}
+    tree = tree_of(tiny("demo"))
+    tree["world"]["terrain"] = [part]
+    (tmp_path / "mine.toml").write_text(tomli_w.dumps(tree))
+    scenario = load_scenario(tmp_path / "mine.toml")
+    relief = simulate(scenario).world.floor.elevation_m
+    assert np.ptp(relief) > 2.0
+    # The resolved scenario finds it from anywhere.
+    assert Path(scenario.world.terrain[0].path) == tmp_path / "bank.tif"
+
+
+def test_a_tide_is_written_for_map_and_moves_the_depth_only(tmp_path):
+    tide = {"tide_amplitude_m": 2.0, "tide_period_s": 3000.0}
+    out = written(tiny("demo", navigation=tide), tmp_path)
+    table = rows_of(out / "tide.csv")
+    assert list(table[0]) == ["time", "height_m"]
+    assert max(abs(float(row["height_m"])) for row in table) > 1.0
+    calm = simulate(tiny("demo")).survey
+    tidal = simulate(tiny("demo", navigation=tide)).survey
+    assert (calm.truth.elevation_m == tidal.truth.elevation_m).all()
+    assert np.abs(calm.estimate.depth_m - tidal.estimate.depth_m).max() > 0.5
