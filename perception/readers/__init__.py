@@ -26,6 +26,7 @@ FORMATS = {
     "starfish": "StarFish logdoc",
     "humminbird": "Humminbird DAT/SON",
     "netcdf": "NetCDF of pings",
+    "jsf": "JSF (EdgeTech)",
 }
 _HEAD_BYTES = 4096
 

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from perception.readers import open_survey, scan_file
+from perception.readers.jsf import HEADER
 from perception.readers.netcdf import write_netcdf
 from perception.records import InputError, Swath
 
@@ -217,3 +218,70 @@ def test_a_netcdf_of_something_else_is_refused_by_what_it_lacks(tmp_path):
     (tmp_path / "cut.nc").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"cut\.nc"):
         scan_file(tmp_path / "cut.nc")
+
+
+# EdgeTech JSF
+
+
+def jsf_message(kind: int, subsystem: int, channel: int, body: bytes) -> bytes:
+    head = struct.pack("<HBBHBBBBHI", 0x1601, 0xD, 0, kind, 0, subsystem, channel, 0, 0, len(body))
+    return head + body
+
+
+def jsf_file(n: int = 40, data_format: int = 0, units: int = 2) -> bytes:
+    rng = np.random.default_rng(8)
+    out = jsf_message(428, 0, 0, b"information" * 3)
+    for i in range(n):
+        for subsystem, count in ((20, 100), (21, 200)):
+            for channel in (0, 1):
+                head = np.zeros(1, HEADER)
+                head["time"], head["ms_today"] = 1700000000 + i // 10, 100 * (i % 10)
+                head["ping"], head["samples"], head["format"] = 1000 + i, count, data_format
+                head["validity"] = 0b0100001001101001
+                if units == 2:
+                    head["x"], head["y"] = -68.8 * 600000, 48.4 * 600000 + 6 * i
+                else:
+                    head["x"], head["y"] = 500000 * 100, (5000000 + i) * 100
+                head["units"] = units
+                head["interval_ns"] = 40000000 // count // 5 * 5
+                head["start_10hz"], head["end_10hz"] = 60000, 60000
+                head["depth_mm"], head["altitude_mm"] = 7500, 4200
+                head["sound_speed"], head["weight"] = 1480.0, 2
+                head["heading_cdeg"], head["pitch"], head["roll"] = 100, 182, -364
+                level = rng.integers(100 * (1 + channel), 100 * (1 + channel) + 50, count)
+                if data_format == 1:
+                    level = np.stack([level, np.zeros(count, int)], axis=1) * [[-1, 1]]
+                body = head.tobytes() + level.astype("<i2").tobytes()
+                out += jsf_message(80, subsystem, channel, body)
+    return out
+
+
+@pytest.mark.parametrize("data_format", [0, 1])
+def test_a_jsf_file_comes_back(tmp_path, data_format):
+    (tmp_path / "a.jsf").write_bytes(jsf_file(data_format=data_format))
+    survey = open_survey([tmp_path / "a.jsf"])
+    assert survey.n_pings == 40 and survey.crs == "EPSG:32619" and survey.utc
+    swath = survey.swath(0)
+    # The finer of two frequencies; weight 2 means a quarter.
+    assert swath.n_samples == 200
+    assert 25 <= np.nanmin(swath.port) and np.nanmax(swath.port) < 37.5  # noqa: SIM300
+    assert 50 <= np.nanmin(swath.starboard) and np.nanmax(swath.starboard) < 62.5  # noqa: SIM300
+    assert_allclose(swath.time_s, 1.7e9 + 0.1 * np.arange(40), atol=1e-6)
+    assert_allclose(swath.sample_m, 200e-6 * 740)
+    assert_allclose(swath.altitude_hint_m, 4.2)
+    assert_allclose(swath.depth_m, 7.5)
+    assert_allclose(np.degrees(swath.roll_rad), -2.0, atol=1e-3)
+    assert_allclose(np.degrees(swath.pitch_rad), 1.0, atol=1e-3)
+    assert survey.files[0].frequency_hz == 600e3
+
+
+def test_a_jsf_in_centimetres_and_with_damage(tmp_path):
+    data = bytearray(jsf_file(units=4))
+    start = data.find(b"\x01\x16", 9000)
+    data[start : start + 100] = bytes(100)
+    (tmp_path / "a.jsf").write_bytes(bytes(data[:-50]))
+    survey = open_survey([tmp_path / "a.jsf"])
+    assert survey.n_pings >= 38
+    assert_allclose(survey.pings.easting_m, 500000.0)
+    assert any("corrupt" in d for d in survey.defects)
+    assert any("mid-message" in d for d in survey.defects)
