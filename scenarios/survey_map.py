@@ -15,15 +15,58 @@ import numpy as np
 from mapping.fixes import PositionFix
 from mapping.fusion import fuse
 from mapping.survey import CorrectedSurvey, correct_survey
+from perception.bottom import BottomTrack
 from perception.levels import SHADOW
+from perception.objects import ObjectTable
 from perception.readers import Survey
-from perception.records import FloatArray, Grid, Progress, Swath, Trajectory, silent
+from perception.records import (
+    BoolArray,
+    ElevationStrip,
+    FloatArray,
+    Grid,
+    Progress,
+    Swath,
+    Trajectory,
+    silent,
+)
 from perception.strips import PassResult, build_strip, common_samples
 
 if TYPE_CHECKING:
-    from perception.inversion import Inversion, Look
+    from perception.inversion import InversionResult, Look
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class PassSummary:
+    """What later stages need of one pass; echoes are read again where they are wanted.
+
+    Attributes
+    ----------
+    strip, objects, bottom : as in `PassResult`.
+    shadow : (port, starboard) shadow masks (n, m), eight samples a byte: they are needed whole only
+        while their own pass is inverted.
+    n_samples : columns of the masks.
+    """
+
+    strip: ElevationStrip
+    objects: ObjectTable
+    bottom: BottomTrack
+    shadow: tuple[np.ndarray, np.ndarray]
+    n_samples: int
+
+    @classmethod
+    def of(cls, result: PassResult) -> PassSummary:
+        port, starboard = (np.packbits(side == SHADOW, axis=1) for side in result.levels)
+        width = result.levels[0].shape[1]
+        return cls(result.strip, result.objects, result.bottom, (port, starboard), width)
+
+    def masks(self) -> tuple[BoolArray, BoolArray]:
+        """Return the shadow masks (n, m) of port and starboard."""
+        port, starboard = (
+            np.unpackbits(side, axis=1, count=self.n_samples).astype(bool) for side in self.shadow
+        )
+        return port, starboard
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +78,7 @@ class SurveyMap:
     grid : the map.
     track : one pose for every side-scan ping in input order; unusable ones interpolated, pass -1.
     raw_track : the same poses as the file's own navigation had them.
-    passes : strip, objects, bottom and levels of each pass, as navigated.
+    passes : strip, objects, bottom and shadows of each pass, as navigated.
     corrected : strips with corrected poses, and what the pose graph says of itself.
     inversion : diagnostics of the joint method; None where the map is of shadows alone.
     """
@@ -43,9 +86,9 @@ class SurveyMap:
     grid: Grid
     track: Trajectory
     raw_track: Trajectory
-    passes: tuple[PassResult, ...]
+    passes: tuple[PassSummary, ...]
     corrected: CorrectedSurvey
-    inversion: Inversion | None
+    inversion: InversionResult | None
 
 
 def map_survey(
@@ -54,7 +97,7 @@ def map_survey(
     fixes: Sequence[PositionFix] = (),
     cell_m: float | None = None,
     method: str = "joint",
-    passes: Sequence[PassResult] | None = None,
+    passes: Sequence[PassSummary] | None = None,
     progress: Progress = silent,
 ) -> SurveyMap:
     """Turn the passes of a survey into one map and one corrected track.
@@ -73,7 +116,7 @@ def map_survey(
         from perception.inversion import invert
 
         looks = [_look(survey, i, result, corrected, track) for i, result in enumerate(results)]
-        inversion = invert(looks, cell_m=cell_m, crs=survey.crs, progress=progress)
+        inversion = invert(looks, cell_m, crs=survey.crs, progress=progress)
         grid = inversion.grid
     else:
         grid = fuse(
@@ -88,12 +131,12 @@ def map_survey(
     return SurveyMap(grid, track, navigated_track(survey), results, corrected, inversion)
 
 
-def build_passes(survey: Survey, progress: Progress = silent) -> tuple[PassResult, ...]:
+def build_passes(survey: Survey, progress: Progress = silent) -> tuple[PassSummary, ...]:
     """Turn every pass into a strip, reading one pass at a time."""
     results = []
     for index in range(survey.n_passes):
         progress("echoes to strips", index, survey.n_passes)
-        results.append(build_strip(survey.swath(index)))
+        results.append(PassSummary.of(build_strip(survey.swath(index))))
     progress("echoes to strips", survey.n_passes, survey.n_passes)
     return tuple(results)
 
@@ -164,7 +207,7 @@ def corrected_swath(swath: Swath, track: Trajectory, height_offset_m: float) -> 
 
 
 def _look(
-    survey: Survey, index: int, result: PassResult, corrected: CorrectedSurvey, track: Trajectory
+    survey: Survey, index: int, result: PassSummary, corrected: CorrectedSurvey, track: Trajectory
 ) -> Look:
     """Return one pass as the joint inversion sees it: on one sample size, at corrected poses."""
     from perception.inversion import Look
@@ -178,11 +221,11 @@ def _look(
         sample_m=np.full(swath.n_pings, sample_m),
         flags=None,
     )
-    port, starboard = result.levels
+    port, starboard = result.masks()
     return Look(
         swath=corrected_swath(swath, track, float(corrected.height_m[index])),
         altitude_m=result.bottom.altitude_m,
         altitude_sigma_m=result.bottom.sigma_m,
-        shadow_port=port == SHADOW,
-        shadow_starboard=starboard == SHADOW,
+        shadow_port=port,
+        shadow_starboard=starboard,
     )
