@@ -27,6 +27,7 @@ FORMATS = {
     "humminbird": "Humminbird DAT/SON",
     "netcdf": "NetCDF of pings",
     "jsf": "JSF (EdgeTech)",
+    "lowrance": "Lowrance SL2/SL3",
 }
 _HEAD_BYTES = 4096
 

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 from perception.readers import open_survey, scan_file
 from perception.readers.jsf import HEADER
+from perception.readers.lowrance import _FRAMES
 from perception.readers.netcdf import write_netcdf
 from perception.records import InputError, Swath
 
@@ -285,3 +286,63 @@ def test_a_jsf_in_centimetres_and_with_damage(tmp_path):
     assert_allclose(survey.pings.easting_m, 500000.0)
     assert any("corrupt" in d for d in survey.defects)
     assert any("mid-message" in d for d in survey.defects)
+
+
+# Lowrance
+
+
+def sl2_file(channels: tuple[int, ...], n: int = 30) -> bytes:
+    out = struct.pack("<HHHH", 2, 0, 3200, 0)
+    rng = np.random.default_rng(9)
+    frame = _FRAMES[2]
+    for i in range(n):
+        for channel in channels:
+            near = rng.integers(10 * channel, 10 * channel + 9, 200).astype(np.uint8)
+            level = near if channel != 5 else np.concatenate([near[:100], 100 + near[100:]])
+            head = np.zeros(1, frame)
+            head["offset"], head["frame_bytes"] = len(out), 144 + len(level)
+            head["channel"], head["packet_bytes"], head["number"] = channel, len(level), 6 * i
+            head["lower_ft"], head["depth_ft"], head["unix_s"] = 30 / 0.3048, 10.0, 1.6e9
+            head["east"], head["north"] = 3585761 + i, 8384000
+            head["heading"], head["ms"] = np.pi / 2, 100 * i
+            out += head.tobytes() + level.tobytes()
+    return out
+
+
+@pytest.mark.parametrize("channels", [(0, 3, 4), (0, 5), (4, 3, 2)])
+def test_an_sl2_log_with_side_scan_comes_back(tmp_path, channels):
+    (tmp_path / "a.sl2").write_bytes(sl2_file(channels))
+    survey = open_survey([tmp_path / "a.sl2"])
+    assert survey.n_pings == 30 and survey.utc
+    swath = survey.swath(0)
+    assert_allclose(swath.altitude_hint_m, 3.048, rtol=1e-6)
+    assert_allclose(np.diff(swath.time_s), 0.1, atol=1e-6)
+    if 5 in channels:
+        assert swath.n_samples == 100 and swath.port.max() < 100 <= swath.starboard.min()
+        assert_allclose(swath.sample_m, 0.3, rtol=1e-6)
+    else:
+        assert swath.port.max() < 40 <= swath.starboard.min()
+        assert_allclose(swath.sample_m, 0.15, rtol=1e-6)
+
+
+def test_an_sl2_without_side_scan_is_told_and_not_mapped(tmp_path):
+    path = tmp_path / "a.sl2"
+    path.write_bytes(sl2_file((0, 2)))
+    assert scan_file(path).packets == {"primary": 30, "downscan": 30}
+    with pytest.raises(InputError, match="holds no side-scan"):
+        open_survey([path])
+
+
+def test_a_damaged_sl2_keeps_the_frames_around(tmp_path):
+    data = bytearray(sl2_file((3, 4)))
+    data[3000:3400] = bytes(400)
+    (tmp_path / "a.sl2").write_bytes(bytes(data[:-30]))
+    survey = open_survey([tmp_path / "a.sl2"])
+    assert survey.n_pings >= 27
+    assert any("corrupt" in d for d in survey.defects)
+
+
+def test_the_ladoga_log_is_told():
+    raw = scan_file(real("lowrance_input.sl2"))
+    assert raw.packets == {"primary": 111, "downscan": 111} and len(raw.pings) == 0
+    assert "water depth 3.98 to 4.22 m" in raw.notes

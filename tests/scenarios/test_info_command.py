@@ -152,3 +152,11 @@ def test_real_files_are_told(bathynav, name, words):
     assert status == 0 and err == ""
     for word in words:
         assert word in out, word
+
+
+def test_a_sound_log_without_side_scan_is_told_by_info(bathynav):
+    path = REAL / "lowrance_input.sl2"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    status, out, _ = bathynav("info", path)
+    assert status == 0 and "111 primary" in out and "cannot be mapped" in out
