@@ -15,9 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.kalman import Fit
-from localization.likelihood import GATE
-from localization.measurements import Soundings
-from localization.terrain import TerrainMap
 from perception.records import FloatArray
 
 # Risk that the error exceeds the protection level, for each update.
@@ -90,50 +87,6 @@ class HealthMonitor:
                 False, f"innovations repeat (autocorrelation {colour:.2f}) as over wrong ground"
             )
         return Verdict(True)
-
-
-class FreeGround:
-    """The rival of every match: the soundings are of ground that the map does not show.
-
-    Each beam's soundings are predicted from that beam's own past, a random walk whose steps have the
-    map's own roughness (`TerrainMap.structure_m2`) over the way its footprint moved. A match is
-    proved when the map predicts soundings better than this by a factor that chance does not give,
-    and refuted when it does worse. It measures what a count of updates cannot: over smooth ground a
-    short track fits in many places, and on a wrong map in some.
-    """
-
-    def __init__(self, terrain: TerrainMap, beams: int) -> None:
-        self.terrain = terrain
-        self.level_m = np.full(beams, np.nan)
-        self.variance_m2 = np.zeros(beams)
-        self.place_m = np.full((2, beams), np.nan)
-
-    def update(self, soundings: Soundings, easting_m: float, northing_m: float) -> float:
-        """Return the log likelihood of an update's soundings and learn them; NaN at the first."""
-        beam = soundings.beam
-        place = np.stack([easting_m + soundings.east_m, northing_m + soundings.north_m])
-        moved = np.hypot(*(place - self.place_m[:, beam]))
-        known = np.isfinite(moved)
-        noise = (soundings.range_sigma_m * soundings.down) ** 2
-        walk = self.terrain.structure_m2(np.where(known, moved, 1.0))
-        predicted = self.variance_m2[beam] + walk
-        spread = predicted + noise
-        innovation = soundings.elevation_m - self.level_m[beam]
-        square = innovation**2 / spread
-        inside = known & (square < GATE**2)
-        gain = np.where(inside, predicted / spread, 0.0)
-        # A new beam, or one that jumped, starts at what it reads.
-        self.level_m[beam] = np.where(
-            inside, self.level_m[beam] + gain * np.where(known, innovation, 0.0),
-            np.where(known, self.level_m[beam], soundings.elevation_m),
-        )  # fmt: skip
-        self.variance_m2[beam] = np.where(
-            inside, (1 - gain) * predicted, np.where(known, predicted, noise)
-        )
-        self.place_m[:, beam] = place
-        if not known.all():
-            return math.nan
-        return float(-0.5 * np.sum(np.minimum(square, GATE**2) + np.log(spread)))
 
 
 def protection_level(covariance: FloatArray, risk: float = RISK) -> float:

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.integrity import FreeGround, HealthMonitor, protection_level, with_doubt
+from localization.integrity import HealthMonitor, protection_level, with_doubt
 from localization.kalman import NO_FIT, KalmanBank
 from localization.measurements import Measurement, Sensors, Soundings, beam_vectors, soundings_of
 from localization.particles import ParticleFilter
+from localization.rival import Evidence
 from localization.terrain import TerrainMap
 from perception.records import FloatArray
 
@@ -34,8 +35,8 @@ CONVERGED, SEARCHING, RECKONING, LOST = "converged", "searching", "dead-reckonin
 _DOUBT = 0.05
 # Evidence is not hoarded above this, so that later failure shows soon; below minus `_REFUTED` the
 # map does worse than no map. Where ground or map tell little, the evidence is a random walk about
-# zero: the bar is low enough for chance to pass it once in e^15.
-_MOST_EVIDENCE, _REFUTED = 20.0, 15.0
+# zero: an allowance for each update keeps that walk from reaching the bar.
+_MOST_EVIDENCE, _LEAST_EVIDENCE, _REFUTED, _ALLOWANCE = 20.0, -6.0, 15.0, 0.1
 # Seconds without a sounding after which the status is dead reckoning.
 _SILENT_S = 15.0
 # A step longer than this, and faster than both speeds below, is a reset of dead reckoning.
@@ -122,10 +123,11 @@ class Navigator:
         self.bank = KalmanBank(terrain, walk, sensors.tide_m_sqrt_h, len(sensors.beams))
         self.health = HealthMonitor()
         self.tracking = False
-        self.rival = FreeGround(terrain, len(sensors.beams))
+        self.rival = Evidence(terrain)
         self.proved = 0
-        self.evidence = 0.0
+        self.evidence, self.against = 0.0, 0.0
         self.losses = 0
+        self.attempts = 0
         self.converged_once = False
         self.last: Measurement | None = None
         self.velocity: FloatArray = np.zeros(2)
@@ -241,9 +243,8 @@ class Navigator:
     # ---- matching ------------------------------------------------------------------------------
 
     def _match(self, m: Measurement, soundings: Soundings) -> str:
-        rival = self.rival.update(soundings, m.easting_m, m.northing_m)
         if self.tracking:
-            return self._track(m, soundings, rival)
+            return self._track(m, soundings)
         tide = self.sensors.tide_m_sqrt_h**2 / 3600.0 * 3.0
         met = self.search.update(soundings, m.easting_m, m.northing_m, self.since_update_m, tide)
         self.since_update_m = 0.0
@@ -261,31 +262,47 @@ class Navigator:
             return ""
         self.bank.start(mean, covariance)
         self.health.reset()
-        self.tracking, self.proved, self.evidence = True, 0, 0.0
+        self.tracking, self.proved = True, 0
+        self.evidence, self.against = -self._surprise(mean, covariance), 0.0
+        self.rival.reset()
         return "place found; on probation"
 
-    def _track(self, m: Measurement, soundings: Soundings, rival: float) -> str:
+    def _surprise(self, mean: FloatArray, covariance: FloatArray) -> float:
+        """Evidence against a place far from where dead reckoning has it, beyond three sigmas."""
+        expected, spread = self.reckoned
+        spread = spread + covariance
+        use = [0, 1, 2, 3]
+        apart = (mean - expected)[use]
+        square = float(apart @ np.linalg.solve(spread[np.ix_(use, use)], apart))
+        # The 99.9 % point of chi-square with four degrees of freedom.
+        return 0.5 * max(square - 18.5, 0.0)
+
+    def _track(self, m: Measurement, soundings: Soundings) -> str:
         mean, covariance = self.bank.moments()
         if _largest(covariance) > 2 * self.config.hand_over_m:
             # Too wide to linearise, after a long silence: search within what is known.
             self.tracking = False
             self.search.start(mean, covariance)
             return "uncertainty outgrew the Kalman bank; searching within it"
+        gained = self.rival.update(
+            soundings, np.array([m.easting_m, m.northing_m]), mean, covariance,
+            self.bank.likeliest(),
+        )  # fmt: skip
         fit = self.bank.update(soundings, m.easting_m, m.northing_m)
         self.since_update_m = 0.0
         if fit is NO_FIT or not len(fit.normalised):
             return ""
         self.heard_s = m.time_s
         if fit.common_step_m:
+            self.rival.reset()
             return f"depth stepped by {fit.common_step_m:+.1f} m; depth bias set free"
         self.health.add(fit, soundings.beam, len(self.sensors.beams))
         verdict = self.health.verdict()
         if not verdict.healthy:
             return self._lose(verdict.reason)
-        if math.isfinite(rival) and len(fit.normalised) == soundings.count:
-            gained = self.evidence + fit.log_likelihood - rival
-            self.evidence = min(gained, _MOST_EVIDENCE)
-        if self.evidence < -_REFUTED:
+        self.evidence = min(max(self.evidence + gained, _LEAST_EVIDENCE), _MOST_EVIDENCE)
+        self.against = min(self.against + gained + _ALLOWANCE, 0.0)
+        if self.against < -_REFUTED:
             return self._lose("free ground explains the soundings better than the map")
         self.proved += 1
         if self._is_proved() and _largest(covariance) < self.config.converged_m:
@@ -295,7 +312,11 @@ class Navigator:
     def _is_proved(self) -> bool:
         if self.converged_once:
             return self.evidence > 0.0
-        return self.proved >= self.config.probation and self.evidence > self.config.proof
+        # Every search that failed is a chance more to be fooled by: the next must prove more.
+        tried = self.attempts
+        return self.proved >= self.config.probation * 2 ** min(
+            tried, 4
+        ) and self.evidence > self.config.proof + 3.0 * min(tried, 3)
 
     def _trust(self) -> str:
         """Keep the state as one to return to; older ones are surer not to be spoilt already."""
@@ -305,12 +326,14 @@ class Navigator:
         self.reckoned = state if self.proved > 60 else self.reckoned
         if not self.converged_once:
             self.losses, self.converged_once = 0, True
+            self.attempts = max(self.attempts - 1, 0)
             return "converged"
         return ""
 
     def _lose(self, reason: str) -> str:
         """Begin again from the last trusted state with a wider box and a free depth bias."""
         self.losses += 1
+        self.attempts += 1
         if self.trusted:
             self.reckoned = self.trusted[0]
             self.trusted = []
