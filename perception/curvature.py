@@ -61,7 +61,6 @@ class Curvature:
     K, sigma_K : per square metre.
     scale_m : Gaussian sigma of the smoothing, or its equivalent; 0 where none.
     noise_m : 1-sigma of the independent part of the heights' noise.
-    surface_m : the smoothed heights that the derivatives belong to.
     """
 
     H: FloatArray
@@ -70,7 +69,6 @@ class Curvature:
     sigma_K: FloatArray
     scale_m: FloatArray
     noise_m: FloatArray
-    surface_m: FloatArray
 
 
 def mean_and_gaussian(d: Derivatives) -> tuple[FloatArray, FloatArray]:
@@ -131,7 +129,7 @@ def _along(z: npt.NDArray[Any], i: int, j: int, di: int, dj: int) -> float:
 
 
 @njit(cache=True)
-def _stencil(z: npt.NDArray[Any], i: int, j: int, box: npt.NDArray[Any]) -> None:
+def stencil(z: npt.NDArray[Any], i: int, j: int, box: npt.NDArray[Any]) -> None:
     """Fill the 3 x 3 box of heights about (i, j), row 0 northernmost."""
     rows, cols = z.shape
     for a in range(3):
@@ -168,14 +166,14 @@ def _derivatives(
             if np.isnan(z[i, j]):
                 out[:, i, j] = np.nan
                 continue
-            _stencil(z, i, j, box)
-            _differentiate(box, dx, dy, fit, d)
+            stencil(z, i, j, box)
+            differentiate(box, dx, dy, fit, d)
             for k in range(5):
                 out[k, i, j] = d[k]
 
 
 @njit(cache=True)
-def _differentiate(
+def differentiate(
     box: npt.NDArray[Any], dx: float, dy: float, fit: bool, d: npt.NDArray[Any]
 ) -> None:
     """Turn nine heights, row 0 northernmost, into p, q, r, s, t."""
@@ -196,58 +194,49 @@ def _differentiate(
 
 
 def curvature_of(
-    surface_m: FloatArray,
-    cell_m: float,
-    cell_north_m: float,
-    gain: NoiseGain,
-    noise_m: FloatArray,
-    step: int = 1,
-    operator: Operator = "difference",
+    d: Derivatives, gain: NoiseGain, noise_m: FloatArray, step: int = 1
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return H, K, sigma_H and sigma_K of a (smoothed) surface, (rows, cols) each.
+    """Return H, K, sigma_H and sigma_K, (rows, cols) each.
 
     The heights' noise is propagated through the fit. First order in H; K = (r t - s^2) / W^4 takes
     the second-order term as well, because its gradient vanishes on a plane while its error does not.
 
     Parameters
     ----------
-    surface_m : (rows, cols); NaN no data.
     gain, noise_m : noise gain of the derivatives and 1-sigma of the independent noise of one cell, on
         every `step`-th row and column from the first, bilinear between; (m, n) each.
     """
-    z = np.ascontiguousarray(surface_m)
     maps = np.stack(
         [
             np.broadcast_to(np.asarray(g, np.float64) * noise_m**2, noise_m.shape)
             for g in (gain.pp, gain.qq, gain.rr, gain.ss, gain.tt, gain.rt)
         ]
     )
-    out = np.empty((4, *z.shape), z.dtype)
-    _curvature(z, cell_m, cell_north_m, operator == "least-squares", maps, step, out)
+    out = np.empty((4, *d.p.shape), d.p.dtype)
+    _curvature(d.p, d.q, d.r, d.s, d.t, maps, step, out)
     return out[0], out[1], out[2], out[3]
 
 
 @njit(cache=True, parallel=True)
 def _curvature(
-    z: npt.NDArray[Any],
-    dx: float,
-    dy: float,
-    fit: bool,
+    p: npt.NDArray[Any],
+    q: npt.NDArray[Any],
+    r: npt.NDArray[Any],
+    s: npt.NDArray[Any],
+    t: npt.NDArray[Any],
     maps: npt.NDArray[Any],
     step: int,
     out: npt.NDArray[Any],
 ) -> None:
-    rows, cols = z.shape
+    rows, cols = p.shape
     for i in prange(rows):
-        box = np.empty((3, 3))
         d = np.empty(5)
         v = np.empty(6)
         for j in range(cols):
-            if np.isnan(z[i, j]):
+            if np.isnan(p[i, j]):
                 out[:, i, j] = np.nan
                 continue
-            _stencil(z, i, j, box)
-            _differentiate(box, dx, dy, fit, d)
+            d[0], d[1], d[2], d[3], d[4] = p[i, j], q[i, j], r[i, j], s[i, j], t[i, j]
             _bilinear_maps(maps, i / step, j / step, v)
             out[0, i, j], out[1, i, j], out[2, i, j], out[3, i, j] = _forms(d, v)
 

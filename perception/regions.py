@@ -108,8 +108,8 @@ def segment(
     if not np.isfinite(grid.elevation_m).any():
         raise InputError("the map holds no height at all (every cell is NaN); nothing to segment")
     progress("regions", 0, 1 + config.levels)
-    smoothing = _smooth(grid, config.scale_m)
-    curvature = _curvature(grid, smoothing, config)
+    smoothing = _smooth(grid, config.scale_m, config.operator)
+    curvature = _curvature(grid, smoothing)
     progress("regions", 1, 1 + config.levels)
     finest = _regions(grid, curvature, config)
     progress("regions", 2, 1 + config.levels)
@@ -119,7 +119,7 @@ def segment(
     for level in range(1, config.levels):
         scale_m = _level_scale(smoothing, grid, level)
         coarse_config = replace(config, scale_m=scale_m, keep_probability=False)
-        rough = _curvature(grid, _smooth(grid, scale_m), coarse_config)
+        rough = _curvature(grid, _smooth(grid, scale_m, config.operator))
         regions = _regions(grid, rough, coarse_config)
         parents.append(_parents(below, regions))
         coarser.append(regions)
@@ -128,8 +128,9 @@ def segment(
     return Segmentation(finest, curvature, tuple(coarser), tuple(parents))
 
 
-def _smooth(grid: Grid, scale_m: float | None) -> Smoothing:
-    return smooth(grid.elevation_m, grid.cell_m, grid.cell_north_m, grid.sigma_m, scale_m)
+def _smooth(grid: Grid, scale_m: float | None, operator: Operator) -> Smoothing:
+    cells = (grid.cell_m, grid.cell_north_m)
+    return smooth(grid.elevation_m, *cells, grid.sigma_m, scale_m, operator)
 
 
 def _level_scale(smoothing: Smoothing, grid: Grid, level: int) -> float:
@@ -138,20 +139,14 @@ def _level_scale(smoothing: Smoothing, grid: Grid, level: int) -> float:
     return base * 2.0**level
 
 
-def _curvature(grid: Grid, smoothing: Smoothing, config: RegionConfig) -> Curvature:
+def _curvature(grid: Grid, smoothing: Smoothing) -> Curvature:
     mean, gauss, sigma_h, sigma_k = curvature_of(
-        smoothing.surface_m,
-        grid.cell_m,
-        grid.cell_north_m,
-        smoothing.gain,
-        smoothing.noise_m,
-        smoothing.step,
-        config.operator,
+        smoothing.derivatives, smoothing.gain, smoothing.noise_m, smoothing.step
     )
     scale = upsample(smoothing.scale_m, smoothing.step, grid.shape)
     scale[np.isnan(mean)] = np.nan
     noise = upsample(smoothing.noise_m, smoothing.step, grid.shape)
-    return Curvature(mean, gauss, sigma_h, sigma_k, scale, noise, smoothing.surface_m)
+    return Curvature(mean, gauss, sigma_h, sigma_k, scale, noise)
 
 
 def _regions(grid: Grid, curvature: Curvature, config: RegionConfig) -> RegionMap:
