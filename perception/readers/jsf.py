@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from perception.readers.raw import RawFile, RawPings, blank_samples, plural
+from perception.readers.raw import RawFile, RawPings, blank_samples, floats, plural
 from perception.records import FloatArray, InputError, IntArray, Progress
 
 _MARK = b"\x01\x16"
@@ -152,14 +152,14 @@ def _file_of(
         offset = np.full(len(pings), -1, np.int64)
         offset[row[mine]] = where[mine, 0]
         weight = np.ones(len(pings))
-        weight[row[mine]] = np.exp2(-np.clip(headers["weight"][mine].astype(float), -31, 31))
+        weight[row[mine]] = np.exp2(-np.clip(floats(headers["weight"][mine]), -31, 31))
         stored = where[mine, 3] // (4 if paired else 2)
         columns[f"{name}_samples"][row[mine]] = np.minimum(_sample_count(headers[mine]), stored)
         offsets.append(offset)
         weights.append(weight)
     longest = np.maximum(columns["port_samples"], columns["starboard_samples"])
     columns["range_m"] = columns["start_m"] + longest * _sample_m(headers[first], columns)
-    frequency = (headers["start_10hz"].astype(float) + headers["end_10hz"]) / 2 * 10.0
+    frequency = (floats(headers["start_10hz"]) + headers["end_10hz"]) / 2 * 10.0
     return JsfFile(
         path=path,
         format="JSF (EdgeTech)",
@@ -210,14 +210,14 @@ def _fill(columns: dict[str, Any], headers: npt.NDArray[Any], defects: list[str]
     columns["depth_m"] = told(_DEPTH, headers["depth_mm"] / 1000.0)
     altitude = told(_ALTITUDE, headers["altitude_mm"] / 1000.0)
     columns["altitude_m"] = np.where(altitude > 0, altitude, np.nan)
-    speed = headers["sound_speed"].astype(float)
+    speed = floats(headers["sound_speed"])
     good = (speed > 1300) & (speed < 1700)
     if not good.all():
         defects.append(f"no sound speed in {plural(int((~good).sum()), 'ping')}: 1500 m/s assumed")
     columns["sound_speed_m_s"] = np.where(good, speed, 1500.0)
     interval_s = headers["interval_ns"] * 1e-9
     columns["start_m"] = headers["first_sample"] * interval_s * columns["sound_speed_m_s"] / 2
-    x, y = headers["x"].astype(float), headers["y"].astype(float)
+    x, y = floats(headers["x"]), floats(headers["y"])
     placed = (x != 0) | (y != 0)
     if ((valid >> _POSITION) & 1).any():
         placed &= (valid >> _POSITION) & 1 == 1

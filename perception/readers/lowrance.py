@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from perception.readers.raw import RawFile, RawPings, blank_samples, plural
+from perception.readers.raw import RawFile, RawPings, blank_samples, floats, plural
 from perception.records import FloatArray, InputError, IntArray, Progress
 
 _CHANNELS = {0: "primary", 1: "secondary", 2: "downscan", 3: "left side-scan", 4: "right side-scan",
@@ -170,17 +170,17 @@ def _fill(columns: dict[str, Any], frames: npt.NDArray[Any]) -> None:
     columns["number"] = frames["number"].astype(np.int64)
     columns["x"], columns["y"] = _geographic(frames)
     # Headings in radians; without a compass the field is zero throughout, which is mended later.
-    columns["heading_deg"] = np.degrees(frames["heading"].astype(float)) % 360.0
+    columns["heading_deg"] = np.degrees(floats(frames["heading"])) % 360.0
     depth_m = frames["depth_ft"] * _FOOT_M
     columns["altitude_m"] = np.where((depth_m > 0) & (depth_m < 12000), depth_m, np.nan)
-    lower_m = frames["lower_ft"].astype(float) * _FOOT_M
+    lower_m = floats(frames["lower_ft"]) * _FOOT_M
     columns["range_m"] = np.where((lower_m > 0) & (lower_m < 3000), lower_m, np.nan)
     columns["start_m"][:] = 0.0
     columns["sound_speed_m_s"][:] = _SOUND_SPEED_M_S
 
 
 def _geographic(frames: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
-    east, north = frames["east"].astype(float), frames["north"].astype(float)
+    east, north = floats(frames["east"]), floats(frames["north"])
     nowhere = (east == 0) & (north == 0)
     latitude = np.degrees(2 * np.arctan(np.exp(np.clip(north / _RADIUS_M, -9, 9))) - np.pi / 2)
     return (
@@ -191,7 +191,7 @@ def _geographic(frames: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
 
 def _notes(frames: npt.NDArray[Any]) -> tuple[str, ...]:
     """Tell of the whole log what an echo sounder gives: time, depth, place."""
-    depth_m = frames["depth_ft"].astype(float) * _FOOT_M
+    depth_m = floats(frames["depth_ft"]) * _FOOT_M
     depth_m = depth_m[np.isfinite(depth_m) & (depth_m > 0) & (depth_m < 12000)]
     lon, lat = _geographic(frames)
     notes = [f"{plural(len(frames), 'frame')} over {np.ptp(frames['ms']) / 1e3:.1f} s"]

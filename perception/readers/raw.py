@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from perception.records import BoolArray, FloatArray, IntArray
 
@@ -125,6 +126,12 @@ def blank_samples(n: int, width: int) -> tuple[FloatArray, FloatArray]:
 def spread_rows(n: int, most: int) -> IntArray:
     """Return at most `most` rows, evenly over `n`: enough to judge a whole file by."""
     return np.unique(np.linspace(0, max(n - 1, 0), min(n, most)).astype(np.int64))
+
+
+def floats(values: npt.ArrayLike) -> FloatArray:
+    """Return values as float64; a signalling NaN of a damaged file turns quiet without a warning."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.asarray(values).astype(np.float64)
 
 
 def plural(count: int, noun: str) -> str:

@@ -19,6 +19,7 @@ from perception.readers.raw import (
     RawFile,
     RawPings,
     blank_samples,
+    floats,
     plural,
     spread_rows,
     valid_degrees,
@@ -264,7 +265,7 @@ def _fill_headers(columns: dict[str, Any], index: XtfIndex, defects: list[str]) 
     heading = _first_filled(pings, ("SensorHeading", "ShipGyro"))
     columns["heading_deg"] = np.where(abs(heading) <= 720, heading, np.nan)
     for name, source in (("pitch_deg", "SensorPitch"), ("roll_deg", "SensorRoll")):
-        angle = pings[source].astype(float)
+        angle = floats(pings[source])
         columns[name] = np.where(abs(angle) <= 90, angle, np.nan)
     attitude = index.kept.get(ATTITUDE)
     if attitude is not None and len(attitude):
@@ -289,17 +290,17 @@ def _first_filled(
 ) -> FloatArray:
     """Return the first of several fields that is not zero throughout; the first if all are."""
     for name in names:
-        values = pings[name].astype(float) * (0.1 if name in decimetres else 1.0)
+        values = floats(pings[name]) * (0.1 if name in decimetres else 1.0)
         if np.any(values[np.isfinite(values)] != 0):
             return values
-    return np.asarray(pings[names[0]].astype(float))
+    return floats(pings[names[0]])
 
 
 def _sound_speed(pings: npt.NDArray[Any], defects: list[str]) -> FloatArray:
     """Return the speed that the ranges were made with: some recorders store half of it."""
-    speed = pings["SoundVelocity"].astype(float)
+    speed = floats(pings["SoundVelocity"])
     if not np.any((speed > 600) & (speed < 1700)):
-        speed = pings["ComputedSoundVelocity"].astype(float)
+        speed = floats(pings["ComputedSoundVelocity"])
     half = (speed > 600) & (speed < 850)
     if half.any():
         defects.append(
@@ -320,10 +321,10 @@ def _sound_speed(pings: npt.NDArray[Any], defects: list[str]) -> FloatArray:
 def _fill_positions(columns: dict[str, Any], index: XtfIndex, utc: bool, defects: list[str]) -> str:
     """Fill x and y; return the CRS, empty for metres of an unknown grid."""
     pings = index.pings
-    x = pings["SensorXcoordinate"].astype(float)
-    y = pings["SensorYcoordinate"].astype(float)
+    x = floats(pings["SensorXcoordinate"])
+    y = floats(pings["SensorYcoordinate"])
     if not np.any(_placed(x, y)):
-        x, y = pings["ShipXcoordinate"].astype(float), pings["ShipYcoordinate"].astype(float)
+        x, y = floats(pings["ShipXcoordinate"]), floats(pings["ShipYcoordinate"])
         if np.any(_placed(x, y)):
             defects.append("no sensor position: the ship's is taken")
     if not np.any(_placed(x, y)):
@@ -396,9 +397,9 @@ def _spanned(record: npt.NDArray[Any], half_speed: FloatArray) -> tuple[FloatArr
     The range field is the recording's length by custom, so with a delay before it the end lies
     further out; where range and duration show that it counts from the transmit, it is taken so.
     """
-    stated = record["SlantRange"].astype(float)
-    duration = record["TimeDuration"].astype(float)
-    delay = np.nan_to_num(record["TimeDelay"].astype(float), posinf=0, neginf=0)
+    stated = floats(record["SlantRange"])
+    duration = floats(record["TimeDuration"])
+    delay = np.nan_to_num(floats(record["TimeDelay"]), posinf=0, neginf=0)
     delay = np.where((delay > 0) & (delay < 1.0), delay, 0.0)
     with np.errstate(invalid="ignore"):
         by_time = np.where((duration > 0) & (duration < 20.0), duration * half_speed, np.nan)
@@ -442,7 +443,7 @@ def _side(
             f"{'far to near' if far_first else 'near to far'} assumed"
         )
     weight = np.where(there, record["Weight"], 0).astype(float)
-    weight = np.where(abs(weight) <= 31, np.exp2(-weight), 1.0)
+    weight = np.exp2(-np.where(abs(weight) <= 31, weight, 0.0))
     return Side(number, offset, count, weight, kind, bool(far_first))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from perception.geodesy import wrap
-from perception.readers.raw import plural
+from perception.readers.raw import floats, plural
 from perception.readers.xtf_time import calendar_seconds
 from perception.records import FloatArray
 
@@ -22,16 +22,16 @@ def packet_times(packets: npt.NDArray[Any], utc: bool) -> FloatArray:
     """Return the times (n,) of attitude or navigation packets on the pings' clock; NaN unknown."""
     names = packets.dtype.names or ()
     if "Millisecond" in names:
-        fraction = packets["Millisecond"].astype(float) / 1e3
+        fraction = floats(packets["Millisecond"]) / 1e3
     else:
-        fraction = packets["Microsecond"].astype(float) / 1e6
+        fraction = floats(packets["Microsecond"]) / 1e6
         # The raw navigation packet counts tenths of milliseconds in sixteen bits.
         if packets["Microsecond"].dtype.itemsize == 2:
-            fraction = packets["Microsecond"].astype(float) / 1e4
+            fraction = floats(packets["Microsecond"]) / 1e4
     since_1970, of_day = calendar_seconds(packets, np.minimum(fraction, 0.9999))
     time_s = since_1970 if utc else of_day
     if utc and "SourceEpoch" in names and np.any(packets["SourceEpoch"]):
-        epoch = packets["SourceEpoch"].astype(float)
+        epoch = floats(packets["SourceEpoch"])
         if "EpochMicroseconds" in names:
             epoch = epoch + packets["EpochMicroseconds"] / 1e6
         time_s = np.where(packets["SourceEpoch"] > 0, epoch, time_s)
@@ -48,8 +48,8 @@ def attitude_at(
     """Replace roll, pitch and, where they agree, heading by the attitude packets' at ping time."""
     ping_s = columns["time_s"]
     packet_s = packet_times(packets, utc)
-    tag = pings["AttitudeTimeTag"].astype(float) / 1e3
-    packet_tag = packets["TimeTag"].astype(float) / 1e3
+    tag = floats(pings["AttitudeTimeTag"]) / 1e3
+    packet_tag = floats(packets["TimeTag"]) / 1e3
     if _overlap(tag, packet_tag) > 0.8 and np.ptp(packet_tag) > 0:
         # The recorder's millisecond counter ties both far better than hundredths of seconds.
         ping_s, packet_s = tag, packet_tag
@@ -58,7 +58,7 @@ def attitude_at(
             f"{plural(len(packets), 'attitude packet')} at other times than the pings: not used"
         )
         return
-    angles = np.stack([packets[n].astype(float) for n in ("Roll", "Pitch", "Heading")])
+    angles = np.stack([floats(packets[n]) for n in ("Roll", "Pitch", "Heading")])
     sane = np.isfinite(packet_s) & np.isfinite(angles).all(0) & (abs(angles) <= 720).all(0)
     order = np.argsort(packet_s[sane], kind="stable")
     packet_s, angles = packet_s[sane][order], angles[:, sane][:, order]
@@ -100,7 +100,7 @@ def positions_at(
 ) -> tuple[FloatArray, FloatArray]:
     """Interpolate the navigation packets' positions to the pings; NaN outside their time."""
     packet_s = packet_times(packets, utc)
-    x, y = packets["RawXcoordinate"].astype(float), packets["RawYcoordinate"].astype(float)
+    x, y = floats(packets["RawXcoordinate"]), floats(packets["RawYcoordinate"])
     good = np.isfinite(packet_s + x + y) & ~((x == 0) & (y == 0)) & (abs(x) < 1e8) & (abs(y) < 1e8)
     order = np.argsort(packet_s[good], kind="stable")
     packet_s, x, y = packet_s[good][order], x[good][order], y[good][order]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from perception.readers.raw import plural
+from perception.readers.raw import floats, plural
 from perception.records import FloatArray
 
 
@@ -34,7 +34,7 @@ def ping_times(pings: npt.NDArray[Any], defects: list[str]) -> tuple[FloatArray,
     Without a date the seconds of the day are kept (a midnight is bridged); without a clock either,
     the attitude time tag in milliseconds, and at last one second a ping.
     """
-    fraction = np.minimum(pings["HSeconds"].astype(float), 99.0) / 100.0
+    fraction = np.minimum(floats(pings["HSeconds"]), 99.0) / 100.0
     utc_s, of_day = calendar_seconds(pings, fraction)
     dated = np.isfinite(utc_s)
     if dated.mean() > 0.5:
@@ -49,7 +49,7 @@ def ping_times(pings: npt.NDArray[Any], defects: list[str]) -> tuple[FloatArray,
         steps = np.diff(np.nan_to_num(of_day))
         days = np.concatenate([[0.0], np.cumsum(steps < -43200.0)])
         return of_day + 86400.0 * days, False
-    tag = pings["AttitudeTimeTag"].astype(float) / 1000.0
+    tag = floats(pings["AttitudeTimeTag"]) / 1000.0
     if len(tag) > 1 and np.ptp(tag) > 0:
         return tag, False
     defects.append("the clock stands still: one second a ping assumed")
