@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
+import numpy.typing as npt
 from scipy import fft
 from scipy.ndimage import uniform_filter
 
@@ -30,14 +32,15 @@ class MatchConfig:
     ----------
     cell_m : cell of the comparison; None follows the strips' resolution.
     highpass_m : structure wider than this is left out: it tells little about place and much about bias.
-    least_evidence : log-likelihood ratio against no match at all, below which a match is refused.
+    least_evidence : log-likelihood ratio against no match at all, beyond the logarithm of the number of
+        places looked at, below which a match is refused.
     least_margin : log-likelihood ratio against the next best shift, likewise.
     """
 
     cell_m: float | None = None
     highpass_m: float = 16.0
-    least_evidence: float = 14.0
-    least_margin: float = 6.0
+    least_evidence: float = 6.0
+    least_margin: float = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,20 +169,30 @@ def _scatter(
     cell: float,
     size: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Average a texture's cells into a square grid (5, size, size), row 0 south."""
+    """Average a texture's cells into a square grid (5, size, size), row 0 south.
+
+    Each datum is shared among the four cells around it: given whole to one cell, a regular lattice of data
+    on a regular grid beats, and every match is off by up to half a datum's spacing.
+    """
     total = np.zeros((5, size, size), np.float32)
     weight = np.zeros((5, size, size), np.float32)
     for i in range(values.shape[0]):
         c, s = np.cos(heading[i]), np.sin(heading[i])
         for j in range(values.shape[1]):
-            col = int(np.floor((east[i] + c * across[j] - west) / cell))
-            row = int(np.floor((north[i] - s * across[j] - south) / cell))
-            if 0 <= col < size and 0 <= row < size:
-                for k in range(5):
-                    w = weights[i, j, k]
-                    if w > 0:
-                        total[k, row, col] += w * values[i, j, k]
-                        weight[k, row, col] += w
+            x = (east[i] + c * across[j] - west) / cell - 0.5
+            y = (north[i] - s * across[j] - south) / cell - 0.5
+            col, row = int(np.floor(x)), int(np.floor(y))
+            if not (0 <= col < size - 1 and 0 <= row < size - 1):
+                continue
+            fx, fy = x - col, y - row
+            for k in range(5):
+                w = weights[i, j, k]
+                if w > 0:
+                    for dy in range(2):
+                        for dx in range(2):
+                            part = w * (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
+                            total[k, row + dy, col + dx] += part * values[i, j, k]
+                            weight[k, row + dy, col + dx] += part
     for k in range(5):
         for row in range(size):
             for col in range(size):
@@ -229,14 +242,18 @@ def match(
     outside = np.ones((size, size), bool)
     outside[edge : edge + inner, edge : edge + inner] = False
     wa[:, outside] = 0.0
+    fields = _channels(a, wa, b, wb, heading_a, heading_b)
     surfaces = {
         channel: surface
-        for channel, fields in _channels(a, wa, b, wb, heading_a, heading_b).items()
-        if (surface := _correlate(*fields, reach)) is not None
+        for channel, field in fields.items()
+        if (surface := _correlate(*field, reach)) is not None
     }
+    _choose_shading_or_echo(surfaces, np.cos(heading_b - heading_a))
     if not surfaces:
         return _refused("no common ground")
-    shift, covariance, evidence, margin, reason = _judge(surfaces, cell_m, config, prior_m2)
+    shift, covariance, evidence, margin, reason = _judge(
+        {c: fields[c] for c in surfaces}, surfaces, inner, cell_m, config, prior_m2
+    )
     if reason and not np.isfinite(covariance).all():
         return _refused(reason)
     height_m, height_sigma_m = _height_between(
@@ -337,6 +354,22 @@ def _same_looks(a: FloatArray, wa: FloatArray, b: FloatArray, wb: FloatArray, al
     return bool(np.mean(side_a * side_b) * np.sign(along) > 0.5)
 
 
+def _choose_shading_or_echo(surfaces: dict[int, _Surface], along: float) -> None:
+    """Keep one of shading and echo where strips look from opposite sides.
+
+    The two are then one correlation with opposite signs: what the slope does is reversed, what the material
+    does is not. The side lobes of either look like peaks of the other, so the stronger extreme decides,
+    and where neither is stronger both are left out.
+    """
+    if abs(along) <= 0.7 or SHADE not in surfaces or ALBEDO not in surfaces:
+        return
+    shade, echo = (float(surfaces[c].significance.max()) for c in (SHADE, ALBEDO))
+    if shade < 2.0 * echo:
+        del surfaces[SHADE]
+    if echo < 2.0 * shade:
+        del surfaces[ALBEDO]
+
+
 @dataclass(frozen=True, slots=True)
 class _Surface:
     """One channel's correlation over the search: (s, s) arrays, row 0 the southernmost shift."""
@@ -346,7 +379,14 @@ class _Surface:
     common: FloatArray
     independent: FloatArray
     scale: FloatArray
-    gradient_variance: FloatArray
+    significance: FloatArray
+
+    def gain(self, row: int, col: int) -> float:
+        """Return what the log-likelihood gains per unit of the raw correlation, 0 where it is negative."""
+        rho, scale = float(self.rho[row, col]), float(self.scale[row, col])
+        if rho <= 0.0 or scale <= 0.0:
+            return 0.0
+        return float(self.independent[row, col]) * rho / (1 - rho**2) / scale
 
 
 def _correlate(
@@ -385,15 +425,17 @@ def _correlate(
     variance_d = variance * np.maximum(common, 1.0) / n_u
     independent = np.minimum(energy**2 / variance_d, np.maximum(common, 1.0))
     likelihood = -0.5 * independent * np.log1p(-(np.maximum(rho, 0.0) ** 2))
-    ky = 2 * np.pi * fft.fftfreq(size)[:, None]
-    kx = 2 * np.pi * fft.rfftfreq(size)
-    xy = (power * ky * kx).sum()
-    gradient = np.array([[(power * kx**2).sum(), xy], [xy, (power * ky**2).sum()]])
-    return _Surface(rho, np.where(good, likelihood, 0.0), common, independent, energy, gradient)
+    significance = np.where(good, num / np.sqrt(variance_d), 0.0)
+    return _Surface(rho, np.where(good, likelihood, 0.0), common, independent, energy, significance)
 
 
 def _judge(
-    surfaces: dict[int, _Surface], cell_m: float, config: MatchConfig, prior_m2: FloatArray | None
+    fields: dict[int, _Fields],
+    surfaces: dict[int, _Surface],
+    inner: int,
+    cell_m: float,
+    config: MatchConfig,
+    prior_m2: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, float, float, str]:
     """Return shift (cells, east and north), covariance (m2), evidence, margin, and why not (or "")."""
     total = np.sum([s.log_likelihood for s in surfaces.values()], axis=0)
@@ -402,38 +444,30 @@ def _judge(
     steps = np.arange(-reach, reach + 1)
     score = np.where(common > 0.3 * common.max(), total, -np.inf)
     if prior_m2 is not None:
-        x, y = np.meshgrid(steps * cell_m, steps * cell_m)
-        inverse = np.linalg.inv(prior_m2)
-        score = score - 0.5 * (
-            inverse[0, 0] * x * x + 2 * inverse[0, 1] * x * y + inverse[1, 1] * y * y
-        )
+        score = score - _prior_cost(steps * cell_m, prior_m2)
     row, col = np.unravel_index(int(np.argmax(score)), score.shape)
     best = np.array([col - reach, row - reach], float)
+    evidence = float(total[row, col])
     nothing = np.full((2, 2), np.nan)
     if row in (0, 2 * reach) or col in (0, 2 * reach):
-        return best, nothing, float(total[row, col]), 0.0, "best at the border of the search"
-    peak = total[row - 1 : row + 2, col - 1 : col + 2]
-    offset, curvature = _parabola(peak)
-    if curvature is None:
-        return best, nothing, float(total[row, col]), 0.0, "no clear peak"
-    spread = np.zeros((2, 2))
-    for s in surfaces.values():
-        rho = max(float(s.rho[row, col]), 0.0)
-        if rho == 0.0:
-            continue
-        gain = float(s.independent[row, col]) * rho / (1 - rho**2) / float(s.scale[row, col])
-        spread += gain**2 * (1 - rho**2) * s.gradient_variance
-    inverse = np.linalg.inv(curvature)
+        return best, nothing, evidence, 0.0, "best at the border of the search"
+    gains = {c: s.gain(int(row), int(col)) for c, s in surfaces.items()}
+    offset, covariance, lobe = _refine(fields, gains, best, inner)
+    if covariance is None or np.abs(offset).max() > 1.5:
+        return best, nothing, evidence, 0.0, "no clear peak"
     # A tenth of a cell is what sampling on a grid leaves of any peak.
-    covariance = (inverse @ spread @ inverse + 0.01 * np.eye(2)) * cell_m**2
-    evidence = float(total[row, col])
-    lobe = 3.0 * np.sqrt(np.maximum(np.diag(inverse) * max(evidence, 1.0), 1.0))
-    far = (np.abs(steps[:, None] - best[1]) > lobe[1]) | (np.abs(steps - best[0]) > lobe[0])
-    second = float(score[far].max()) if far.any() else -np.inf
-    margin = float(score[row, col]) - second
+    covariance = (covariance + 0.1**2 * np.eye(2)) * cell_m**2
+    reach_of_peak = np.maximum(3.0 * lobe * np.sqrt(max(evidence, 1.0)), 3.0)
+    far = (np.abs(steps[:, None] - best[1]) > reach_of_peak[1]) | (
+        np.abs(steps - best[0]) > reach_of_peak[0]
+    )
+    margin = float(score[row, col]) - (float(score[far].max()) if far.any() else 0.0)
+    # The more places are looked at, the better the best of them fits by chance.
+    places = max(1.0, float((2 * reach) ** 2 / np.prod(2.0 * np.maximum(lobe, 0.5)) / 4.0))
+    needed = config.least_evidence + float(np.log(places))
     reason = ""
-    if evidence < config.least_evidence:
-        reason = f"too little in common (evidence {evidence:.1f})"
+    if evidence < needed:
+        reason = f"too little in common (evidence {evidence:.1f} of {needed:.1f})"
     elif margin < config.least_margin:
         reason = f"not the only fit (margin {margin:.1f})"
     elif np.sqrt(np.linalg.eigvalsh(covariance).max()) > 0.4 * reach * cell_m:
@@ -441,17 +475,77 @@ def _judge(
     return best + offset, covariance, evidence, margin, reason
 
 
-def _parabola(peak: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-    """Return the top of a parabola through (3, 3) values, and its negative second derivative."""
-    y, x = np.mgrid[-1:2, -1:2]
-    design = np.stack(
-        [np.ones(9), x.ravel(), y.ravel(), x.ravel() ** 2, (x * y).ravel(), y.ravel() ** 2]
+def _prior_cost(steps_m: FloatArray, prior_m2: FloatArray) -> FloatArray:
+    x, y = np.meshgrid(steps_m, steps_m)
+    inverse = np.linalg.inv(prior_m2)
+    cost: FloatArray = 0.5 * (
+        inverse[0, 0] * x * x + 2 * inverse[0, 1] * x * y + inverse[1, 1] * y * y
     )
-    c = np.linalg.lstsq(design.T, peak.ravel().astype(float), rcond=None)[0]
-    curvature = -np.array([[2 * c[3], c[4]], [c[4], 2 * c[5]]])
-    if np.linalg.eigvalsh(curvature).min() <= 1e-9:
-        return np.zeros(2), None
-    return np.clip(np.linalg.solve(curvature, c[1:3]), -1.0, 1.0), curvature
+    return cost
+
+
+def _refine(
+    fields: dict[int, _Fields], gains: dict[int, float], best: FloatArray, inner: int
+) -> tuple[FloatArray, FloatArray | None, FloatArray]:
+    """Climb to the top of the summed correlation below a cell; return offset, covariance, lobe (cells).
+
+    With X(k) the cross-spectrum of the squares at the whole-cell shift, the correlation's slope at a
+    further shift d is the sum of -k Im X exp(ikd), its curvature that of -k k' Re X exp(ikd). What the two
+    squares share has no imaginary part at the right d; what they do not has random phase. So the sum of
+    k k' (Im X)^2 is the slope's variance, and curvature^-1 variance curvature^-1 the shift's (the
+    sandwich), whatever the fields' spectra.
+    """
+    # Channels that share their speckle (shading and echo) add up before they are squared below.
+    total = np.zeros((inner, inner // 2 + 1), complex)
+    filled = 0.0
+    for channel, gain in gains.items():
+        if gain > 0:
+            spectrum, part = _cross_spectrum(fields[channel], best, inner)
+            total += spectrum * (gain / inner**2)
+            filled = max(filled, part)
+    if not filled:
+        return np.zeros(2), None, np.ones(2)
+    ky = 2 * np.pi * fft.fftfreq(inner)[:, None]
+    kx = 2 * np.pi * fft.rfftfreq(inner)[None, :]
+    twice = np.full(kx.shape, 2.0)
+    twice[0, 0] = 1.0
+    if inner % 2 == 0:
+        twice[0, -1] = 1.0
+    offset, nothing = np.zeros(2), np.ones(2)
+    for last in (False, False, True):
+        turn = np.exp(1j * (kx * offset[0] + ky * offset[1]))
+        x = total * turn
+        slope = -np.array([(kx * twice * x.imag).sum(), (ky * twice * x.imag).sum()])
+        curvature = _second_moments(kx, ky, twice * x.real)
+        if np.linalg.eigvalsh(curvature).min() <= 0:
+            return offset, None, nothing
+        inverse = np.linalg.inv(curvature)
+        if last:
+            # Where the squares are filled in part, neighbouring modes move together.
+            spread = _second_moments(kx, ky, (twice * x.imag) ** 2) / filled
+            return offset, inverse @ spread @ inverse, np.sqrt(np.diag(inverse))
+        offset = offset + np.clip(inverse @ slope, -0.8, 0.8)
+    raise AssertionError("unreachable: the last round returns")
+
+
+def _cross_spectrum(
+    field: _Fields, best: FloatArray, inner: int
+) -> tuple[npt.NDArray[np.complexfloating[Any]], float]:
+    """Return the cross-spectrum of the two squares at a whole-cell shift, and how far they are filled."""
+    u, wu, v, wv = field
+    edge = (u.shape[0] - inner) // 2
+    here = np.s_[edge : edge + inner, edge : edge + inner]
+    col, row = best.astype(int)
+    there = np.s_[edge + row : edge + row + inner, edge + col : edge + col + inner]
+    both = (wu[here] > 0) & (wv[there] > 0)
+    left = np.where(both, wu[here] * u[here], 0.0)
+    right = np.where(both, wv[there] * v[there], 0.0)
+    return np.conj(fft.rfft2(left)) * fft.rfft2(right), float(both.mean())
+
+
+def _second_moments(kx: FloatArray, ky: FloatArray, weight: FloatArray) -> FloatArray:
+    xy = (kx * ky * weight).sum()
+    return np.array([[(kx * kx * weight).sum(), xy], [xy, (ky * ky * weight).sum()]])
 
 
 def _height_between(
