@@ -53,13 +53,10 @@ class HealthMonitor:
         """Number of updates with soundings in the window."""
         return len(self.normalised)
 
-    def add(self, fit: Fit, beam: FloatArray, beams: int) -> None:
-        """Take one update's fit; `beam` (n,) tells which beam each residual belongs to."""
+    def add(self, fit: Fit, beams: int) -> None:
+        """Take one update's fit, of a vehicle with so many beams."""
         row = np.full(beams, np.nan)
-        if len(fit.normalised) == len(beam):
-            row[beam] = fit.normalised
-        elif len(fit.normalised):
-            row[: len(fit.normalised)] = fit.normalised
+        row[fit.beam] = fit.normalised
         self.normalised.append(row)
 
     def verdict(self) -> Verdict:

@@ -21,11 +21,10 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from localization.likelihood import DEFAULT_LENGTH_M, GATE
-from localization.measurements import Soundings
-from localization.terrain import TerrainMap, linearise
-from perception.records import BoolArray, FloatArray
+from localization.terrain import TerrainMap
+from localization.view import DEPTH, EAST, NORTH, SCALE, TURN, View
+from perception.records import BoolArray, FloatArray, IntArray
 
-EAST, NORTH, TURN, SCALE, DEPTH = range(5)
 # Random walks of dead reckoning to choose among, m per square root of an hour, and their prior
 # weights: from a DVL-aided inertial system to one that slips or drifts with unmeasured currents.
 _WALKS_M_SQRT_H = {0.5: 0.3, 2.0: 0.3, 7.0: 0.25, 25.0: 0.15}
@@ -53,17 +52,19 @@ class Fit:
     ----------
     normalised : (n,) residual over its predicted sigma, every sounding that met the map.
     used : (n,) inside the gate.
+    beam : (n,) index of the beam.
     common_step_m : shift of all soundings together that would make them fit, 0 if there is none.
     log_likelihood : of the soundings used.
     """
 
     normalised: FloatArray
     used: BoolArray
+    beam: IntArray
     common_step_m: float
     log_likelihood: float
 
 
-NO_FIT = Fit(np.zeros(0), np.zeros(0, bool), 0.0, 0.0)
+NO_FIT = Fit(np.zeros(0), np.zeros(0, bool), np.zeros(0, np.int64), 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +105,11 @@ class TerrainKalman:
 
     def __init__(
         self,
-        terrain: TerrainMap,
         hypothesis: Hypothesis,
         mean: FloatArray,
         covariance: FloatArray,
         beams: int,
     ) -> None:
-        self.terrain = terrain
         self.assumed = hypothesis
         self.beams = beams if beams <= _MOST_BEAMS else 0
         size = 5 + self.beams
@@ -150,25 +149,25 @@ class TerrainKalman:
         self.filter.F, self.filter.Q = f, q
         self.filter.predict()
 
-    def update(self, soundings: Soundings, easting_m: float, northing_m: float) -> Fit:
+    def update(self, view: View) -> Fit:
         """Correct the state by an update's soundings; wild ones are left out."""
-        z, predicted, jacobian, noise = self._model(soundings, easting_m, northing_m)
-        if not len(z):
-            return NO_FIT
-        innovation = z - predicted
-        spread = jacobian @ self.filter.P @ jacobian.T + np.diag(noise)
-        normalised = innovation / np.sqrt(np.diag(spread))
+        predicted, jacobian, noise = self._model(view)
+        innovation = view.elevation_m - predicted
+        across = jacobian @ self.filter.P @ jacobian.T
+        variance = across.diagonal() + noise
+        normalised = innovation / np.sqrt(variance)
         used = np.abs(normalised) < _GATE
-        step = _common_step(innovation, np.sqrt(np.diag(spread)), used)
+        step = _common_step(innovation, np.sqrt(variance), used)
+        wild = _cost_of_wild(variance[~used])
         if not used.any():
-            return Fit(normalised, used, step, _cost_of_wild(np.diag(spread)))
-        z, predicted, jacobian, noise = z[used], predicted[used], jacobian[used], noise[used]
-        self.filter.update(z, lambda x: jacobian, lambda x: predicted, R=np.diag(noise))
-        log_likelihood = -0.5 * (
-            self.filter.y @ self.filter.SI @ self.filter.y + np.linalg.slogdet(self.filter.S)[1]
+            return Fit(normalised, used, view.beam, step, wild)
+        h, hx = jacobian[used], predicted[used]
+        self.filter.update(
+            view.elevation_m[used], lambda x: h, lambda x: hx, R=np.diag(noise[used])
         )
-        wild = _cost_of_wild(np.diag(spread)[~used])
-        return Fit(normalised, used, step, float(log_likelihood) + wild)
+        y, inverse = self.filter.y, self.filter.SI
+        fit = -0.5 * (float(y @ inverse @ y) + float(np.linalg.slogdet(self.filter.S)[1]))
+        return Fit(normalised, used, view.beam, step, fit + wild)
 
     def loosen_depth(self, step_m: float) -> None:
         """Let the depth bias move by a step: a sensor was reset, or ballast shifted."""
@@ -176,52 +175,29 @@ class TerrainKalman:
         self.filter.P[:, DEPTH] = 0.0
         self.filter.P[DEPTH, DEPTH] = step_m**2
 
-    def _model(
-        self, s: Soundings, easting_m: float, northing_m: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Measured and predicted elevations, Jacobian and variances of the soundings on the map."""
-        x, p = self.filter.x, self.filter.P
-        spread = p[:2, :2] + 1e-9 * np.eye(2)
-        # Below half a cell the nodes would all lie on one bilinear patch, whose slope is noise.
-        least = (0.5 * self.terrain.cell_m) ** 2
-        root = np.linalg.cholesky(spread + least * np.eye(2))
-        east = s.east_m + x[TURN] * s.north_m
-        north = s.north_m - x[TURN] * s.east_m
-        plane = linearise(
-            self.terrain.height_m, self.terrain.frame, easting_m + x[EAST] + east,
-            northing_m + x[NORTH] + north, root,
-        )  # fmt: skip
-        on_map = np.isfinite(plane[:, 0])
-        height, slope_e, slope_n, left = plane[on_map].T
-        beam = s.beam[on_map]
-        jacobian = np.zeros((len(height), len(x)))
-        jacobian[:, EAST], jacobian[:, NORTH] = slope_e, slope_n
-        jacobian[:, TURN] = slope_e * north[on_map] - slope_n * east[on_map]
-        jacobian[:, DEPTH] = 1.0
-        predicted = height + x[DEPTH]
-        noise = (
-            self.assumed.noise_factor
-            * s.range_sigma_m
-            * (s.down + _padded(on_map, slope_e) * s.out_east + _padded(on_map, slope_n) * s.out_north)
-        )[on_map] ** 2 + self.assumed.white_m2 + left  # fmt: skip
+    def _model(self, view: View) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Predicted elevations, Jacobian and variances of the soundings."""
+        n = len(view.height_m)
+        jacobian = np.zeros((n, 5 + self.beams))
+        jacobian[:, :5] = view.jacobian
+        x = self.filter.x
+        # The depth bias enters whole; the rest by how far this filter is from the view's centre.
+        apart = x[:5] - view.centre
+        apart[DEPTH] = x[DEPTH]
+        predicted = view.height_m + view.jacobian @ apart
+        noise = self.assumed.noise_factor**2 * view.range_m2 + self.assumed.white_m2 + view.left_m2
         if self.beams:
-            jacobian[np.arange(len(height)), 5 + beam] = 1.0
-            predicted = predicted + x[5 + beam]
+            jacobian[np.arange(n), 5 + view.beam] = 1.0
+            predicted = predicted + x[5 + view.beam]
         else:
             # Too many beams to carry: all that share a place count as one.
-            noise = noise + self.assumed.shared_m**2 * max(len(height), 1)
-        return s.elevation_m[on_map], predicted, jacobian, noise
+            noise = noise + self.assumed.shared_m**2 * max(n, 1)
+        return predicted, jacobian, noise
 
 
 def _cost_of_wild(variance: FloatArray) -> float:
     """Log likelihood of soundings outside the gate, whatever they read; see `likelihood`."""
     return float(-0.5 * np.sum(GATE**2 + np.log(variance)))
-
-
-def _padded(mask: BoolArray, values: FloatArray) -> FloatArray:
-    out = np.zeros(len(mask))
-    out[mask] = values
-    return out
 
 
 def _common_step(innovation: FloatArray, sigma: FloatArray, used: BoolArray) -> float:
@@ -240,7 +216,6 @@ class KalmanBank:
     def __init__(
         self, terrain: TerrainMap, walk_m_sqrt_h: float | None, tide_m_sqrt_h: float, beams: int
     ) -> None:
-        self.terrain = terrain
         self.assumed = hypotheses(terrain, walk_m_sqrt_h)
         self.tide_m2_s = tide_m_sqrt_h**2 / 3600.0
         self.beams = beams
@@ -249,9 +224,7 @@ class KalmanBank:
 
     def start(self, mean: FloatArray, covariance: FloatArray) -> None:
         """Begin tracking from a Gaussian of (east, north, turn, scale, depth bias)."""
-        self.filters = [
-            TerrainKalman(self.terrain, h, mean, covariance, self.beams) for h in self.assumed
-        ]
+        self.filters = [TerrainKalman(h, mean, covariance, self.beams) for h in self.assumed]
         self.log_weight = np.log([h.weight for h in self.assumed])
 
     def predict(self, step_e: float, step_n: float, seconds: float, slip_m2: float = 0.0) -> None:
@@ -265,9 +238,11 @@ class KalmanBank:
         for f in self.filters:
             f.filter.x[:2] += jump
 
-    def update(self, soundings: Soundings, easting_m: float, northing_m: float) -> Fit:
+    def update(self, view: View) -> Fit:
         """Correct every filter; return the fit of the likeliest, with the bank's log likelihood."""
-        fits = [f.update(soundings, easting_m, northing_m) for f in self.filters]
+        if not len(view.height_m):
+            return NO_FIT
+        fits = [f.update(view) for f in self.filters]
         best = fits[int(np.argmax(self.log_weight))]
         if best.common_step_m:
             for f in self.filters:

@@ -17,11 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.integrity import HealthMonitor, protection_level, with_doubt
-from localization.kalman import NO_FIT, KalmanBank
+from localization.kalman import KalmanBank
 from localization.measurements import Measurement, Sensors, Soundings, beam_vectors, soundings_of
 from localization.particles import ParticleFilter
 from localization.rival import Evidence
 from localization.terrain import TerrainMap
+from localization.view import view_of
 from perception.records import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -284,19 +285,18 @@ class Navigator:
             self.tracking = False
             self.search.start(mean, covariance)
             return "uncertainty outgrew the Kalman bank; searching within it"
-        gained = self.rival.update(
-            soundings, np.array([m.easting_m, m.northing_m]), mean, covariance,
-            self.bank.likeliest(),
-        )  # fmt: skip
-        fit = self.bank.update(soundings, m.easting_m, m.northing_m)
+        place = np.array([m.easting_m, m.northing_m])
+        view = view_of(self.terrain, soundings, place, mean, covariance)
+        gained = self.rival.update(view, self.bank.likeliest())
+        fit = self.bank.update(view)
         self.since_update_m = 0.0
-        if fit is NO_FIT or not len(fit.normalised):
+        if not len(fit.normalised):
             return ""
         self.heard_s = m.time_s
         if fit.common_step_m:
             self.rival.reset()
             return f"depth stepped by {fit.common_step_m:+.1f} m; depth bias set free"
-        self.health.add(fit, soundings.beam, len(self.sensors.beams))
+        self.health.add(fit, len(self.sensors.beams))
         verdict = self.health.verdict()
         if not verdict.healthy:
             return self._lose(verdict.reason)

@@ -19,10 +19,10 @@ import math
 
 import numpy as np
 
-from localization.kalman import EAST, NORTH, TURN, Hypothesis
+from localization.kalman import Hypothesis
 from localization.likelihood import GATE
-from localization.measurements import Soundings
-from localization.terrain import TerrainMap, linearise
+from localization.terrain import TerrainMap
+from localization.view import View
 from perception.records import BoolArray, FloatArray
 
 # Soundings remembered: twelve pings of four beams reach back to where the aft beams repeat the fore.
@@ -42,7 +42,6 @@ class Evidence:
     """
 
     def __init__(self, terrain: TerrainMap) -> None:
-        self.terrain = terrain
         self.covariance = fitted_covariance(*terrain.structure)
         self.reset()
 
@@ -52,25 +51,28 @@ class Evidence:
         self.known = np.zeros((0, 6))
         self.misses = 0
 
-    def update(
-        self,
-        soundings: Soundings,
-        place_m: FloatArray,
-        state: FloatArray,
-        covariance: FloatArray,
-        assumed: Hypothesis,
-    ) -> float:
+    def update(self, view: View, assumed: Hypothesis) -> float:
         """Return the evidence gained by an update's soundings, and learn them.
 
         Parameters
         ----------
-        place_m : (2,) dead-reckoned position.
-        state, covariance : the match before this update; see `KalmanBank.moments`.
+        view : the soundings over the map, from the match before this update.
         assumed : what the match assumes of noise and map error; the rival is granted its noise.
         """
-        every = max(1, math.ceil(soundings.count / _MOST_BEAMS))
-        new = self._rows(soundings, place_m, state, covariance, assumed)[::every]
-        new = new[np.isfinite(new[:, 3])]
+        noise = assumed.noise_factor**2 * view.range_m2
+        new = np.stack(
+            [
+                view.east_m,
+                view.north_m,
+                view.elevation_m,
+                view.elevation_m - view.height_m,
+                noise,
+                noise + view.unplaced_m2 + view.left_m2 + assumed.white_m2,
+            ],
+            axis=1,
+        )
+        every = max(1, math.ceil(len(new) / _MOST_BEAMS))
+        new = new[::every]
         gained = 0.0
         if len(self.known) >= 2 and len(new):
             free, fits_free = self._log_likelihood(new, 2, self.covariance)
@@ -89,33 +91,6 @@ class Evidence:
             return new[fits]
         self.reset()
         return new
-
-    def _rows(
-        self,
-        s: Soundings,
-        place_m: FloatArray,
-        state: FloatArray,
-        covariance: FloatArray,
-        assumed: Hypothesis,
-    ) -> FloatArray:
-        east = place_m[0] + state[EAST] + s.east_m + state[TURN] * s.north_m
-        north = place_m[1] + state[NORTH] + s.north_m - state[TURN] * s.east_m
-        root = np.linalg.cholesky(covariance[:2, :2] + (0.5 * self.terrain.cell_m) ** 2 * np.eye(2))
-        plane = linearise(self.terrain.height_m, self.terrain.frame, east, north, root)
-        noise = (assumed.noise_factor * s.range_sigma_m * s.down) ** 2
-        slope = plane[:, 1:3]
-        unplaced = np.einsum("ni,ij,nj->n", slope, covariance[:2, :2], slope) + plane[:, 3]
-        return np.stack(
-            [
-                east,
-                north,
-                s.elevation_m,
-                s.elevation_m - plane[:, 0],
-                noise,
-                noise + unplaced + assumed.white_m2,
-            ],
-            axis=1,
-        )
 
     def _log_likelihood(
         self, new: FloatArray, column: int, covariance: tuple[float, float, float]
