@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import grey_closing, median_filter, uniform_filter1d
 from scipy.signal import savgol_filter
 
 from perception.records import BoolArray, FloatArray
@@ -94,7 +94,8 @@ def track_bottom(
     coarse, contrast = _coarse_track(sides, nearest, config)
     firsts, noise = zip(*(_refine(side, coarse, nearest, config) for side in sides), strict=True)
     valid = _is_valid(contrast)
-    return _assemble(np.array(firsts), np.array(noise), valid, sample_m, altitude_hint_m, config)
+    track = _assemble(np.array(firsts), np.array(noise), valid, sample_m, altitude_hint_m, config)
+    return _below_objects(track, sides, sample_m)
 
 
 def _log_power(power: FloatArray) -> FloatArray:
@@ -389,6 +390,51 @@ def _carried(
     altitude = np.where(valid, altitude_m, carried)
     first = np.where(valid, first_m, carried)
     return altitude, first, np.where(valid, sigma_m, np.hypot(sigma_m, spread))
+
+
+def _below_objects(track: BottomTrack, sides: list[FloatArray], sample_m: float) -> BottomTrack:
+    """Put the altitude back on the floor where an object to the side echoes first.
+
+    Such an object makes a short dip in the track, while the floor's own edge still stands at the
+    range the track has on either side of the dip. Dips are found by closing the track (largest, then
+    least value over a stretch); the edge decides whether the floor goes through beneath.
+    """
+    n = len(track.altitude_m)
+    samples = track.altitude_m / sample_m
+    window = min(n, _DIP_PINGS) | 1
+    closed = grey_closing(samples, window, mode="nearest")
+    sigma = track.sigma_m / sample_m
+    dip = closed - samples > np.maximum(3 * sigma, 2.5)
+    if not dip.any():
+        return track
+    m = sides[0].shape[1]
+    image = np.nanmean(np.stack(sides), axis=0) if len(sides) > 1 else sides[0]
+    usual = float(np.median(_edge_step(image, samples, np.flatnonzero(~dip), m)))
+    rows = np.flatnonzero(dip)
+    through = _edge_step(image, closed, rows, m) > 0.4 * usual
+    rows = rows[through]
+    altitude = track.altitude_m.copy()
+    altitude[rows] = closed[rows] * sample_m
+    spread = track.sigma_m.copy()
+    spread[rows] = np.maximum(spread[rows], 1.5 * sample_m)
+    return BottomTrack(altitude, spread, track.first_return_m, track.valid)
+
+
+# An object beside the track is passed within this many pings; a longer rise is the floor itself.
+_DIP_PINGS = 61
+
+
+def _edge_step(image: FloatArray, track: FloatArray, rows: np.ndarray, m: int) -> FloatArray:
+    """Return the step of log level across the track at `rows`, six samples to either side."""
+    if len(rows) == 0:
+        return np.zeros(0)
+    at = track[rows].astype(int)[:, None]
+    before = np.clip(at + np.arange(-7, -1), 0, m - 1)
+    after = np.clip(at + np.arange(1, 7), 0, m - 1)
+    step: FloatArray = np.nanmean(image[rows[:, None], after], axis=1) - np.nanmean(
+        image[rows[:, None], before], axis=1
+    )
+    return step
 
 
 def _hint_scale(hint_m: FloatArray, altitude_m: FloatArray) -> tuple[FloatArray | None, float]:

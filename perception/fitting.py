@@ -59,31 +59,56 @@ _ASPECT_SIGMA = 0.5
 _SHAPE_MEAN, _SHAPE_SIGMA = float(np.log(1.7)), 0.6
 _SHAPE_BOUNDS = (float(np.log(0.8)), float(np.log(8.0)))
 # The floor's angular law is near Lambert's square, but recorders and sediments differ.
-_LAW_MEAN, _LAW_SIGMA = float(np.log(1.8)), 0.3
+_LAW_MEAN, _LAW_SIGMA = float(np.log(1.8)), 0.25
 _FACETS_PER_BIN = 1.5
-# Rounds of climbing from every start, and from the best of each kind afterwards.
-_FIRST_ROUNDS, _LAST_ROUNDS = 5, 25
+# Starts of each kind that are climbed from, rounds of it, and rounds from the best of each kind.
+_TRIED_STARTS, _FIRST_ROUNDS, _LAST_ROUNDS = 3, 5, 20
 
 
-def fit_patch(patch: Patch, starts: list[tuple[float, float, FloatArray]]) -> BumpFit | None:
-    """Return the most likely fit over all starts (sign, corner, parameters), or None where none converges."""
+def fit_patch(
+    patch: Patch, starts: list[tuple[float, float, FloatArray]], favour: float = 0.0
+) -> BumpFit | None:
+    """Return the most likely fit over all starts (sign, corner, parameters), or None where none converges.
+
+    `favour` is what other evidence adds to the log likelihood of a hill over a crater.
+    """
     flat_value = _flat_likelihood(patch)
-    first = [
-        _climb(patch, sign, corner, start, flat_value, _FIRST_ROUNDS)
-        for sign, corner, start in starts
+    scored = [
+        (_likelihood(patch, sign, corner, at) + _prior(at)[0], sign, corner, at)
+        for sign, corner, at in starts
     ]
-    last = []
+    first = []
     for sign in (1.0, -1.0):
-        own = sorted((f for f in first if f is not None and f.sign == sign), key=lambda f: -f.gain)
+        own = sorted((s for s in scored if s[1] == sign), key=lambda s: -s[0])
+        first += [_climb(patch, *s[1:], flat_value, _FIRST_ROUNDS) for s in own[:_TRIED_STARTS]]
+    last = []
+    best = max((f.gain for f in first if f is not None), default=0.0)
+    for sign in (1.0, -1.0):
+        mine = sorted((f for f in first if f is not None and f.sign == sign), key=lambda f: -f.gain)
         # A kind that is far behind after the first rounds will not catch up.
-        best = max((f.gain for f in first if f is not None), default=0.0)
-        for fit in own[:2]:
+        for fit in mine[:1]:
             if fit.gain > 0.6 * best:
                 last.append(
                     _climb(patch, sign, fit.corner, fit.parameters, flat_value, _LAST_ROUNDS)
                 )
     found = [fit for fit in last if fit is not None]
-    return max(found, key=lambda fit: fit.gain) if found else None
+    return max(found, key=lambda fit: fit.gain + 0.5 * fit.sign * favour) if found else None
+
+
+def _facet_m(patch: Patch) -> float:
+    """Return the facets' ground length: a part of a bin at the patch's far edge."""
+    far_m = patch.start_m + patch.ratio.shape[1] * patch.step_m
+    ground_m = np.sqrt(max(far_m**2 - float(patch.drop_m.mean()) ** 2, 1e-2))
+    return float(patch.step_m * far_m / ground_m / _FACETS_PER_BIN)
+
+
+def _fixed(patch: Patch) -> tuple[FloatArray, FloatArray, float, float, float, float, float, float]:
+    return (patch.drop_m, patch.along_m, patch.start_m, patch.step_m, patch.leak, _facet_m(patch),
+            HIGHLIGHT_CAP, patch.weight)  # fmt: skip
+
+
+def _likelihood(patch: Patch, sign: float, corner: float, at: FloatArray) -> float:
+    return float(log_likelihood(at, sign, corner, patch.ratio, *_fixed(patch)))
 
 
 def _flat_likelihood(patch: Patch) -> float:
@@ -116,16 +141,7 @@ def _climb(
     patch: Patch, sign: float, corner: float, start: FloatArray, flat_value: float, rounds: int
 ) -> BumpFit | None:
     """Climb the posterior from `start` by damped Fisher scoring."""
-    ground_far = np.sqrt(
-        max(
-            (patch.start_m + patch.ratio.shape[1] * patch.step_m) ** 2 - patch.drop_m.mean() ** 2,
-            1e-2,
-        )
-    )
-    slant_far = patch.start_m + patch.ratio.shape[1] * patch.step_m
-    facet_m = patch.step_m * slant_far / ground_far / _FACETS_PER_BIN
-    fixed = (patch.drop_m, patch.along_m, patch.start_m, patch.step_m, patch.leak, facet_m,
-             HIGHLIGHT_CAP, patch.weight)  # fmt: skip
+    fixed = _fixed(patch)
     at = start.copy()
     damping = 1e-2
     value, gradient, information = fisher_step(at, sign, corner, patch.ratio, *fixed)

@@ -8,6 +8,7 @@ pings stands in, with a wider sigma.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -234,7 +235,11 @@ def _measure(
     start_m, end_m = shadow.start[peak] * sample_m, shadow.end[peak] * sample_m
     if not start_m > drop * 1.0001:
         return None
-    fit = fit_patch(patch, _starts(shadow, start_m, end_m, drop, track))
+    order = _order_evidence(shadow, ratio, levels.looks)
+    starts = _starts(shadow, start_m, end_m, drop, track)
+    if abs(order) > _SURE_ORDER:
+        starts = [start for start in starts if start[0] * order > 0]
+    fit = fit_patch(patch, starts, favour=_ORDER_WEIGHT * order)
     if fit is not None and fit.gain < config.min_gain:
         return None
     floor_sigma = (
@@ -248,6 +253,31 @@ def _measure(
     return _of_shadow(shadow, ratio, levels, sample_m, start_m, end_m, drop, drop_sigma, track)
 
 
+def _order_evidence(shadow: _Shadow, ratio: FloatArray, looks: float) -> float:
+    """Return how surely the highlight comes before the shadow, in standard deviations (after: negative).
+
+    The founding paper's rule (highlight then shadow is a hill, shadow then highlight a crater) on all
+    pings of the shadow at once: columns of samples before its start and after its end are averaged
+    over the pings, and the brighter stretch on either side is compared.
+    """
+    core = np.flatnonzero(shadow.lengths >= 0.5 * shadow.lengths.max())
+    length = int(np.median(shadow.lengths[core]))
+    reach, window = max(6, int(1.2 * length)), max(2, length // 5)
+    steps = np.arange(reach)
+    m = ratio.shape[1]
+    brightest, number = [], 0
+    for edges, direction in ((shadow.start[core] - 1, -1), (shadow.end[core], 1)):
+        columns = edges[:, None] + direction * steps
+        inside = (columns >= 0) & (columns < m)
+        values = ratio[(shadow.row0 + core)[:, None], np.clip(columns, 0, m - 1)]
+        values = np.where(inside & np.isfinite(values), np.minimum(values, 8.0), 1.0)
+        profile = np.convolve(values.mean(axis=0), np.full(window, 1 / window), mode="valid")
+        brightest.append(float(profile.max()))
+        number = len(core) * window
+    spread = np.sqrt(2 / (number * min(looks, 4.0)))
+    return float(np.log(brightest[0] / brightest[1]) / spread)
+
+
 def _peak_row(shadow: _Shadow) -> int:
     """Return the row of the longest shadow, of lengths smoothed over three pings."""
     lengths = shadow.lengths.astype(float)
@@ -256,8 +286,14 @@ def _peak_row(shadow: _Shadow) -> int:
     return int(np.argmax(np.where(shadow.start >= 0, lengths, -1)))
 
 
+# Beyond this many standard deviations the order of levels alone settles the kind; below, each counts for this
+# much log likelihood.
+_SURE_ORDER, _ORDER_WEIGHT = 4.0, 3.0
+
 # A patch is averaged down to at most this many lines and bins: the fit's cost is their product.
-_PATCH_LINES, _PATCH_BINS = 28, 150
+_PATCH_LINES, _PATCH_BINS = 24, 110
+# Many looks would make the fit surer than the family of shapes is true, and the priors mute.
+_MOST_WEIGHT = 1.0
 
 
 def _patch(
@@ -292,13 +328,17 @@ def _patch(
     independent = min(1.0, levels.independent * wide) if wide > 1 else levels.independent
     weight = levels.looks * independent * tall * (wide if levels.independent == 1 else 1.0)
     lines = np.s_[row0:row1]
+    drop = track.altitude_m[lines].reshape(-1, tall).mean(axis=1)
+    # Close to nadir the nominal level says nothing: the floor's bins there are as long as an object.
+    slant = (col0 + (np.arange(mean.shape[1]) + 0.5) * wide) * sample_m
+    mean[slant < 1.03 * drop[:, None]] = np.nan
     return Patch(
         ratio=np.ascontiguousarray(mean),
         along_m=np.ascontiguousarray(track.along_m[lines].reshape(-1, tall).mean(axis=1)),
-        drop_m=np.ascontiguousarray(track.altitude_m[lines].reshape(-1, tall).mean(axis=1)),
+        drop_m=np.ascontiguousarray(drop),
         start_m=col0 * sample_m,
         step_m=wide * sample_m,
-        weight=float(np.clip(weight, 0.2, 8.0)),
+        weight=float(np.clip(weight, 0.2, _MOST_WEIGHT)),
         leak=levels.shadow_level,
     )
 
@@ -306,27 +346,34 @@ def _patch(
 def _starts(
     shadow: _Shadow, start_m: float, end_m: float, drop: float, track: Track
 ) -> list[tuple[float, float, FloatArray]]:
-    """Return starting points of the fit: a bump and a pit, smooth and steep."""
+    """Return starting points of the fit: bumps and pits, short and long, smooth and steep."""
     y0, half = _along_extent(shadow, track)
-    x_start, x_end = (float(ground_range(np.array(v), np.array(drop))) for v in (start_m, end_m))
+    x_start = float(ground_range(np.array(start_m), np.array(drop)))
     high = float(hill_height(end_m - start_m, start_m, drop))
     deep = float(crater_depth(end_m - start_m, start_m, drop))
-    middle = 0.5 * (x_start + x_end)
-    # Sign, outline, beta, size against the shadow's half width along the track, centre, height.
-    guesses = (
-        (1.0, 2.0, 1.0, 0.8, x_start - 0.4 * half, high),
-        (1.0, 2.0, 2.0, 0.65, x_start, high),
-        (1.0, 2.0, 5.0, 1.0, x_start - 0.9 * half, high),
-        (1.0, 6.0, 5.0, 0.9, x_start - 0.8 * half, high),
-        (-1.0, 2.0, 1.0, 0.9, x_start + half, 1.2 * deep),
-        (-1.0, 2.0, 3.0, 1.0, max(middle, x_start + 0.8 * half), 1.2 * deep),
-    )
     law = np.log(1.8)
-    return [
-        (sign, corner,
-         np.array([x0, y0, np.log(a), np.log(size * half), np.log(size * half), np.log(beta), law]))
-        for sign, corner, beta, size, x0, a in guesses
-    ]  # fmt: skip
+    starts = []
+    for size_x, beta, lag in itertools.product((0.4, 0.7, 1.1, 1.7), (1.0, 2.0, 5.0), (0.1, 0.6)):
+        sx, sy = size_x * half, (0.8 if beta == 1.0 else 0.95) * half
+        corners = (2.0, 6.0) if beta == 5.0 else (2.0,)
+        for corner in corners:
+            # The grazing point lies `lag` sizes behind the summit; lower by the shape's fall to there.
+            fall = np.exp(0.5 * lag ** (2 * beta))
+            at = [
+                x_start - lag * sx,
+                y0,
+                np.log(high * fall),
+                np.log(sx),
+                np.log(sy),
+                np.log(beta),
+                law,
+            ]
+            starts.append((1.0, corner, np.array(at)))
+            # A pit's near rim lies a size and more before its centre.
+            rim = x_start + (1.6 if beta == 1.0 else 1.1) * sx * (0.7 + 0.6 * lag)
+            at = [rim, y0, np.log(1.25 * deep), np.log(sx), np.log(sy), np.log(beta), law]
+            starts.append((-1.0, corner, np.array(at)))
+    return starts
 
 
 def _along_extent(shadow: _Shadow, track: Track) -> tuple[float, float]:

@@ -21,7 +21,7 @@ N_PARAMETERS = 7
 LEAST_MEAN = 0.15
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, out):  # type: ignore[no-untyped-def]
     """Fill `out` (n, m) with the mean echo per slant bin, 1 where the flat floor shows.
 
@@ -78,15 +78,16 @@ def predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, fa
         for k in range(m):
             near, far = start_m + k * step_m, start_m + (k + 1) * step_m
             floor = max(min(far, r_low) - near, 0.0) + max(far - max(near, r_resume), 0.0)
-            ray = 0.5 * (near + far)
-            ground = max(ray * ray - drop * drop, 0.25 * step_m * step_m) ** 0.5
-            # Flat floor: cos^kappa of the incidence times the ground length of a bin.
-            flat = (drop / ray) ** kappa * step_m * ray / ground
-            out[i, k] = out[i, k] / flat + min(floor / step_m, 1.0) + leak
+            if out[i, k] > 0.0:
+                ray = 0.5 * (near + far)
+                ground = max(ray * ray - drop * drop, 0.25 * step_m * step_m) ** 0.5
+                # Flat floor: cos^kappa of the incidence times the ground length of a bin.
+                out[i, k] /= (drop / ray) ** kappa * step_m * ray / ground
+            out[i, k] += min(floor / step_m, 1.0) + leak
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _trace(
     row, x_low, x_high, dy, x0, sx, height, beta, corner, kappa, drop, start_m, step_m, facet_m
 ):  # type: ignore[no-untyped-def]
@@ -124,7 +125,7 @@ def _trace(
     return max(x_high, -drop / horizon if horizon < 0 else 1e9)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _height(x, dy, x0, sx, height, beta, corner):  # type: ignore[no-untyped-def]
     if corner == 2.0:
         q = ((x - x0) / sx) ** 2 + dy
@@ -138,7 +139,7 @@ def _height(x, dy, x0, sx, height, beta, corner):  # type: ignore[no-untyped-def
     return height * np.exp(-0.5 * power)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _deposit(row, r_a, r_b, energy, start_m, step_m):  # type: ignore[no-untyped-def]
     """Spread a facet's energy evenly over the bins between its two ends' slant ranges."""
     low = (min(r_a, r_b) - start_m) / step_m
@@ -159,7 +160,7 @@ def _deposit(row, r_a, r_b, energy, start_m, step_m):  # type: ignore[no-untyped
             row[k] += energy * part
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _soft(mean, cap):  # type: ignore[no-untyped-def]
     """Compress means above 0.6 cap smoothly: a hard cut would leave the fit no slope to climb."""
     bend = 0.6 * cap
@@ -168,7 +169,7 @@ def _soft(mean, cap):  # type: ignore[no-untyped-def]
     return bend + bend * (1.0 - np.exp(-(mean - bend) / bend))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def fisher_step(
     parameters, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
 ):  # type: ignore[no-untyped-def]
@@ -224,7 +225,7 @@ def fisher_step(
     return value, gradient, information
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def log_likelihood(
     parameters, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
 ):  # type: ignore[no-untyped-def]
