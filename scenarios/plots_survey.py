@@ -17,7 +17,7 @@ def plot_map(path: Path, grid: Grid, raw: Trajectory | None, track: Trajectory |
     """Draw shaded relief with the track as navigated (dashed) and as corrected (solid)."""
     figure, axes = _sheet(grid)
     low, high = np.nanpercentile(grid.elevation_m, [1, 99])
-    axes.imshow(_shaded(grid, low, high), extent=_extent(grid), interpolation="nearest")
+    axes.imshow(shaded_relief(grid, low, high), extent=_extent(grid), interpolation="nearest")
     _colour_bar(figure, axes, low, high, "viridis", "elevation, m")
     for poses, style, name in ((raw, "--", "as navigated"), (track, "-", "corrected")):
         if poses is not None:
@@ -59,7 +59,8 @@ def _extent(grid: Grid) -> tuple[float, float, float, float]:
     return grid.west_m, grid.east_m, grid.south_m, grid.north_m
 
 
-def _shaded(grid: Grid, low: float, high: float) -> FloatArray:
+def shaded_relief(grid: Grid, low: float, high: float) -> FloatArray:
+    """Return the (rows, cols, 3) picture of a grid: colours by height, shaded from the north-west."""
     from matplotlib import colormaps
     from matplotlib.colors import LightSource
 

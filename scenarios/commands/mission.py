@@ -34,6 +34,7 @@ _HEADLINES = {
 def run_and_tell(scenario: Scenario, out: Path, *, quiet: bool) -> int:
     """Run a mission, write its report and print its table."""
     from scenarios.pipeline import run_mission
+    from scenarios.report.overview import plot_overview
     from scenarios.report.page import write_report
 
     prepare_out(out)
@@ -43,6 +44,7 @@ def run_and_tell(scenario: Scenario, out: Path, *, quiet: bool) -> int:
             click.echo(f"{stage} ...", err=True)
 
     metrics = run_mission(scenario, out, quiet=quiet, say=say)
+    plot_overview(out, out / "overview.png")
     report = write_report(out)
     if not quiet:
         print_table(f"\n{scenario.name} (seed {scenario.seed})", _rows(metrics))

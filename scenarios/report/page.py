@@ -155,6 +155,10 @@ def _render(folder: Path, metrics: dict[str, Any], sections: list[Section]) -> s
         title=_title(metrics, folder),
         subtitle=metrics.get("config", {}).get("summary", "") or "What this folder holds.",
         sections=sections,
+        # A mission's own pictures; a single stage's are in its section.
+        pictures=[_picture(p) for p in sorted(folder.glob("*.png"))]
+        if sections[0].name != folder.name
+        else [],
         headline=_numbers(metrics) if len(sections) > 1 or sections[0].name in STAGES else [],
         versions=metrics.get("versions", versions()),
         seed="–" if metrics.get("seed") is None else metrics["seed"],

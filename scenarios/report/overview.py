@@ -1,0 +1,175 @@
+"""One picture of a whole mission: echoes, truth, map and tracks, regions, position, route."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapping.rasters import read_map
+from mapping.trajectories import read_trajectory
+from perception.files import whole_file
+from perception.records import FloatArray, Grid, Trajectory
+from scenarios.plots_survey import shaded_relief
+
+_CLASS_COLOURS = (
+    "#ffffff", "#b2182b", "#2166ac", "#ef8a62", "#67a9cf", "#fddbc7", "#d1e5f0", "#f2f2f2", "#c2a5cf",
+)  # fmt: skip
+
+
+def plot_overview(out: Path, path: Path) -> None:
+    """Draw the mission in `out` (all stages done) into `path`."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 8.6), layout="constrained")
+    axes = figure.subplots(2, 3)
+    truth = read_map(out / "simulate" / "truth" / "elevation.tif")
+    grid = read_map(out / "map" / "map.tif")
+    limits = tuple(np.nanpercentile(grid.elevation_m, [1, 99]))
+    _echoes(axes[0, 0], out)
+    _relief(axes[0, 1], _cut(truth, grid), limits, "the true sea floor (kept from every estimate)")
+    _relief(axes[0, 2], grid, limits, "the map from echoes, track before and after")
+    _tracks(axes[0, 2], out / "map")
+    _regions(axes[1, 0], out / "regions", grid)
+    _position(axes[1, 1], out)
+    _route(axes[1, 2], out / "plan", grid, limits)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=90)
+
+
+def _cut(truth: Grid, frame: Grid) -> Grid:
+    """Return the truth's part under the map."""
+    e, n = truth.centres()
+    cols = (e > frame.west_m) & (e < frame.east_m)
+    rows = (n > frame.south_m) & (n < frame.north_m)
+    return Grid(
+        truth.elevation_m[np.ix_(rows, cols)],
+        float(e[cols][0] - truth.cell_m / 2),
+        float(n[rows][0] + truth.cell_m / 2),
+        truth.cell_m,
+        truth.crs,
+    )
+
+
+def _extent_from(grid: Grid, origin: Grid) -> tuple[float, float, float, float]:
+    """Return imshow's extent in metres from the south-west corner of `origin`."""
+    return (
+        grid.west_m - origin.west_m, grid.east_m - origin.west_m,
+        grid.south_m - origin.south_m, grid.north_m - origin.south_m,
+    )  # fmt: skip
+
+
+def _echoes(axes: Any, out: Path) -> None:
+    from perception.readers import open_survey
+
+    survey = open_survey(sorted((out / "simulate").glob("survey*.xtf")))
+    swath = survey.swath(min(1, survey.n_passes - 1))
+    image = np.concatenate([swath.port[:, ::-1], swath.starboard], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        level = np.log10(np.where(image > 0, image, np.nan))
+    low, high = np.nanpercentile(level, [5, 99])
+    reach_m = swath.n_samples * float(np.median(swath.sample_m))
+    axes.imshow(
+        level, cmap="copper", vmin=low, vmax=high, aspect="auto",
+        extent=(-reach_m, reach_m, swath.n_pings, 0),
+    )  # fmt: skip
+    axes.set(title="echoes of one pass", xlabel="slant range, m", ylabel="ping")
+
+
+def _relief(axes: Any, grid: Grid, limits: tuple[float, ...], title: str) -> None:
+    axes.imshow(
+        shaded_relief(grid, limits[0], limits[1]),
+        extent=_extent_from(grid, grid),
+        interpolation="nearest",
+    )
+    axes.set(title=title, xlabel="m", ylabel="m")
+
+
+def _tracks(axes: Any, folder: Path) -> None:
+    grid = read_map(folder / "map.tif")
+    for name, style, colour in (
+        ("trajectory-navigated.csv", "--", "#ff5a3c"),
+        ("trajectory.csv", "-", "white"),
+    ):
+        track = read_trajectory(folder / name)
+        numbers = np.zeros(len(track.time_s)) if track.pass_index is None else track.pass_index
+        for number in np.unique(numbers[numbers >= 0]):
+            rows = numbers == number
+            axes.plot(
+                track.easting_m[rows] - grid.west_m,
+                track.northing_m[rows] - grid.south_m,
+                style,
+                color=colour,
+                lw=1,
+            )
+
+
+def _regions(axes: Any, folder: Path, grid: Grid) -> None:
+    import rasterio
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch
+
+    from perception.records import REGION_CLASSES
+
+    with rasterio.open(folder / "regions.tif") as source:
+        classes = source.read(1)
+    axes.imshow(
+        classes, cmap=ListedColormap(_CLASS_COLOURS), vmin=-0.5, vmax=8.5,
+        extent=_extent_from(grid, grid), interpolation="nearest",
+    )  # fmt: skip
+    handles = [
+        Patch(color=colour, label=name)
+        for colour, name in zip(_CLASS_COLOURS[1:], REGION_CLASSES[1:], strict=True)
+    ]
+    axes.legend(handles=handles, fontsize=7, ncols=4, loc="lower center", framealpha=0.9)
+    axes.set(title="regions by mean and Gaussian curvature", xlabel="m", ylabel="m")
+
+
+def _position(axes: Any, out: Path) -> None:
+    truth = read_trajectory(out / "simulate" / "truth" / "nav.csv")
+    found = read_trajectory(out / "locate" / "trajectory.csv")
+    raw = np.genfromtxt(out / "simulate" / "nav.csv", delimiter=",", names=True)
+    minutes = (found.time_s - found.time_s[0]) / 60.0
+
+    def error(easting_m: FloatArray, northing_m: FloatArray) -> FloatArray:
+        return np.hypot(
+            easting_m - np.interp(found.time_s, truth.time_s, truth.easting_m),
+            northing_m - np.interp(found.time_s, truth.time_s, truth.northing_m),
+        )
+
+    axes.semilogy(minutes, error(raw["easting_m"], raw["northing_m"]), "--", label="dead reckoning")
+    axes.semilogy(minutes, error(found.easting_m, found.northing_m), label="with terrain fixes")
+    axes.semilogy(minutes, _claimed(found), color="0.6", lw=1, label="claimed 1-sigma")
+    axes.legend(fontsize=8)
+    axes.set(
+        title="position error of the run back over the ground",
+        xlabel="minutes",
+        ylabel="horizontal error, m",
+    )
+
+
+def _claimed(track: Trajectory) -> FloatArray:
+    return np.hypot(track.sigma_easting_m, track.sigma_northing_m)
+
+
+def _route(axes: Any, folder: Path, grid: Grid, limits: tuple[float, ...]) -> None:
+    _relief(axes, grid, limits, "a route near the bottom, proved clear")
+    path = folder / "route.csv"
+    if not path.exists():
+        axes.set_title("no route: see the report for the reason")
+        return
+    route = np.genfromtxt(path, delimiter=",", names=True)
+    e, n = route["easting_m"] - grid.west_m, route["northing_m"] - grid.south_m
+    axes.plot(e, n, color="white", lw=2)
+    axes.plot(e[[0, -1]], n[[0, -1]], "o", color="#ff5a3c", ms=5)
+    inset = axes.inset_axes((0.05, 0.04, 0.9, 0.24))
+    inset.plot(route["distance_m"], route["depth_m"], color="white", lw=1.2)
+    inset.fill_between(
+        route["distance_m"], route["depth_m"] + route["altitude_m"],
+        float(np.max(route["depth_m"] + route["altitude_m"])) + 1, color="#7a6a55",
+    )  # fmt: skip
+    inset.invert_yaxis()
+    inset.set_facecolor("#24405c")
+    inset.tick_params(labelsize=7, colors="white")
+    inset.set_ylabel("depth, m", fontsize=7, color="white")
