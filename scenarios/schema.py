@@ -128,7 +128,7 @@ class SonarSection(Section):
     horizontal_beam_deg: float = Field(default=0.8, gt=0, le=20, description="one-way -3 dB width")
     vertical_beam_deg: float = Field(default=55.0, gt=0, le=120, description="one-way -3 dB width")
     tilt_deg: float = Field(default=30.0, ge=0, le=90, description="beam's axis below the horizon")
-    azimuths: int = Field(default=7, ge=1, le=101, description="directions summed across the beam")
+    azimuths: int = Field(default=5, ge=1, le=101, description="directions summed across the beam")
     lambert_exponent: float = Field(default=2.0, ge=0, le=6, description="power of cos(incidence)")
     nadir_lobe_db: float | None = Field(
         default=3.0,

@@ -147,8 +147,9 @@ def record(
     )
     reference = int(2 * model.samples / 3)
     scale = _NOMINAL_COUNTS / np.sqrt(max(nominal[reference] * gain[reference], 1e-300))
-    amplitude = np.sqrt(echo.astype(np.float64) * gain) * scale
-    return np.minimum(np.rint(amplitude), 65535).astype(np.uint16)
+    echo *= (gain * scale**2).astype(np.float32)
+    amplitude = np.rint(np.sqrt(echo, out=echo), out=echo)
+    return np.minimum(amplitude, 65535, out=amplitude).astype(np.uint16)
 
 
 def _leakage(echo: npt.NDArray[np.float32], leakage_db: float) -> npt.NDArray[np.float32]:
