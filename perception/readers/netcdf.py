@@ -57,6 +57,13 @@ VARIABLES: dict[str, tuple[dict[str, str], str]] = {
 _NEEDED = ("time", "easting", "northing", "heading", "sample_interval")
 _EPOCH = "seconds since 1970-01-01T00:00:00Z"
 _BLOCK = 512
+# Beyond these a value is damage; it is then unknown.
+_LIMITS = {
+    "easting": (-1e8, 1e8), "northing": (-1e8, 1e8), "depth": (-100.0, 12000.0),
+    "altitude": (0.0, 12000.0), "heading": (-720.0, 720.0), "pitch": (-90.0, 90.0),
+    "roll": (-180.0, 180.0), "sample_interval": (1e-6, 100.0), "sound_speed": (1300.0, 1700.0),
+    "scan_angle": (-720.0, 720.0), "time": (-1e11, 1e11),
+}  # fmt: skip
 
 
 def recognises(path: Path, head: bytes) -> bool:
@@ -80,9 +87,18 @@ class NetcdfFile(RawFile):
                 for first in range(0, len(rows), _BLOCK):
                     part = rows[first : first + _BLOCK]
                     # One slab per block of rows: the file is compressed in blocks of pings.
-                    slab = _plain(stored[int(part.min()) : int(part.max()) + 1, :most])
+                    slab = self._slab(stored, int(part.min()), int(part.max()) + 1, most)
                     values[first : first + len(part), :most] = slab[part - part.min()]
         return out
+
+    def _slab(self, stored: Any, first: int, stop: int, most: int) -> npt.NDArray[np.float64]:
+        try:
+            return _plain(stored[first:stop, :most])
+        except RuntimeError as error:
+            raise InputError(
+                f"{self.path}: samples of pings {first} to {stop - 1} are damaged ({error}); "
+                "copy the file again"
+            ) from error
 
 
 def _opened(path: Path) -> Any:
@@ -98,7 +114,8 @@ def _opened(path: Path) -> Any:
 
 def _plain(values: Any) -> npt.NDArray[np.float64]:
     """Return values as floats with NaN where masked."""
-    return np.ma.filled(np.ma.asarray(values).astype(np.float64), np.nan)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.ma.filled(np.ma.asarray(values).astype(np.float64), np.nan)
 
 
 def scan(path: Path, progress: Progress) -> NetcdfFile:
@@ -138,7 +155,9 @@ def _file_of(path: Path, data: Any) -> NetcdfFile:
                     f"{path}: {name} has shape {data.variables[name].shape}, the pings are {n}; "
                     "give one value a ping"
                 )
-            found[name] = np.array(values)
+            low, high = _LIMITS[name]
+            with np.errstate(invalid="ignore"):
+                found[name] = np.where((values >= low) & (values <= high), values, np.nan)
     for name in sides:
         if data.variables[name].ndim != 2 or data.variables[name].shape[0] != n:
             raise InputError(
