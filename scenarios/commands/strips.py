@@ -1,0 +1,153 @@
+"""`bathynav strips SURVEY...`: one elevation strip per pass, and the objects found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from scenarios.commands.console import (
+    common_options,
+    out_option,
+    prepare_out,
+    print_table,
+    progress_bars,
+    set_verbosity,
+)
+
+if TYPE_CHECKING:
+    from perception.objects import ObjectTable
+    from perception.strips import PassResult
+
+
+@click.command()
+@click.argument("surveys", nargs=-1, required=True, type=click.Path(path_type=Path))
+@out_option
+@click.option("--crs", help="Projected CRS in metres (EPSG:N); default the data's UTM zone.")
+@click.option(
+    "--cell",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Columns of a strip, m; default two samples.",
+)
+@click.option("--install", type=click.Path(path_type=Path), help="Lever arms and mounting, TOML.")
+@click.option("--tide", type=click.Path(path_type=Path), help="Tide, a CSV file.")
+@click.option("--sound-speed", metavar="M_S|PROFILE.csv", help="Sound speed, or its profile.")
+@common_options
+def command(
+    surveys: tuple[Path, ...],
+    out: Path,
+    crs: str | None,
+    cell: float | None,
+    install: Path | None,
+    tide: Path | None,
+    sound_speed: str | None,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Turn each pass in SURVEY files into an elevation strip: strip-NNN.nc and a picture.
+
+    objects.csv lists hills and craters of all passes with heights and 1-sigma.
+
+    \b
+    bathynav strips survey.xtf --out strips
+    """
+    import time
+
+    from perception.installation import read_installation
+    from perception.objects import ObjectTable, write_objects_csv
+    from perception.readers import open_survey
+    from perception.records import InputError
+    from perception.strip_files import write_strip
+    from perception.strips import StripConfig, build_strip
+    from scenarios.outputs import write_metrics
+    from scenarios.plots_strips import plot_pass
+
+    set_verbosity(quiet, verbose)
+    prepare_out(out)
+    _clear(out)
+    config = StripConfig(cell_m=cell)
+    installation = read_installation(install, tide, sound_speed)
+    began = time.perf_counter()
+    tables: list[ObjectTable] = []
+    measured: dict[str, float] = {}
+    refused: list[str] = []
+    with progress_bars(quiet) as progress:
+        survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
+        for warning in survey.warnings:
+            click.echo(f"note: {warning}", err=True)
+        # One pass in memory at a time: a survey may be larger than memory.
+        for index in range(survey.n_passes):
+            progress("echoes to strips", index, survey.n_passes)
+            try:
+                result = build_strip(survey.swath(index), config)
+            except InputError as error:
+                refused.append(str(error))
+                click.echo(f"note: {error}; left out", err=True)
+                continue
+            write_strip(out / f"strip-{index:03d}.nc", result.strip, survey.utc)
+            plot_pass(out / f"strip-{index:03d}.png", result)
+            tables.append(result.objects)
+            _add_up(measured, result)
+        progress("echoes to strips", survey.n_passes, survey.n_passes)
+    if not tables:
+        raise InputError(
+            refused[0] if refused else f"{surveys[0]}: holds no pass to make a strip of"
+        )
+    objects = ObjectTable.joined(tables)
+    write_objects_csv(out / "objects.csv", objects)
+    metrics = _metrics(measured, objects, len(tables), time.perf_counter() - began)
+    write_metrics(
+        out, metrics, {"surveys": [str(p) for p in surveys], "crs": survey.crs, "cell_m": cell}
+    )
+    if not quiet:
+        print_table("strips", [(name, _shown(value)) for name, value in metrics.items()])
+        click.echo(f"written to {out}")
+
+
+def _clear(out: Path) -> None:
+    """Remove the strips of an earlier run: a shorter survey must not leave the longer one's behind."""
+    for pattern in ("strip-[0-9]*.nc", "strip-[0-9]*.png"):
+        for path in out.glob(pattern):
+            path.unlink()
+
+
+def _add_up(measured: dict[str, float], result: PassResult) -> None:
+    """Add one pass to the sums that the metrics are means of."""
+    import numpy as np
+
+    lines = len(result.along_m)
+    found: dict[str, float] = {
+        "pings": lines,
+        "length_m": float(result.along_m[-1] - result.along_m[0]),
+        "bottom": float(result.bottom.valid.sum()),
+        "altitude": float(result.bottom.altitude_m.sum()),
+        "sigma": float(np.nansum(result.strip.sigma_m)),
+        "cells": float(np.isfinite(result.strip.sigma_m).sum()),
+        "shadow": float(result.strip.shadow.sum()),
+    }
+    for name, value in found.items():
+        measured[name] = measured.get(name, 0.0) + value
+
+
+def _metrics(
+    measured: dict[str, float], objects: ObjectTable, passes: int, seconds: float
+) -> dict[str, Any]:
+    pings, cells = measured["pings"], max(measured["cells"], 1.0)
+    return {
+        "passes": passes,
+        "pings": int(pings),
+        "length_m": measured["length_m"],
+        "bottom_found_percent": 100 * measured["bottom"] / pings,
+        "mean_altitude_m": measured["altitude"] / pings,
+        "mean_sigma_m": measured["sigma"] / cells,
+        "shadow_percent": 100 * measured["shadow"] / cells,
+        "hills": objects.kind.count("hill"),
+        "craters": objects.kind.count("crater"),
+        "seconds": seconds,
+        "pings_per_minute": 60 * pings / max(seconds, 1e-9),
+    }
+
+
+def _shown(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
