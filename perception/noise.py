@@ -39,7 +39,8 @@ def independent_noise(z: FloatArray, sigma_m: FloatArray | None, step: int) -> F
         hardly bends the surface, so what is seen is taken. Cells where it is not a positive number
         are passed over.
     """
-    nodes = ((z.shape[0] - 1) // step + 1, (z.shape[1] - 1) // step + 1)
+    # The last node lies at or beyond the last cell, so that none is extrapolated.
+    nodes = ((z.shape[0] + step - 2) // step + 1, (z.shape[1] + step - 2) // step + 1)
     seen = _to_nodes(_block_scatter(z), nodes, step)
     if sigma_m is None:
         return np.where(np.isfinite(seen), seen, 0.0)

@@ -22,7 +22,8 @@ def class_image(regions: RegionMap) -> npt.NDArray[np.float64]:
     """Return the classes' colours, (rows, cols, 3) in 0..1; no data is white."""
     colours = np.ones((len(REGION_CLASSES), 3))
     for code, text in CLASS_COLOURS.items():
-        colours[code] = [int(text[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+        for channel, start in enumerate((1, 3, 5)):
+            colours[code, channel] = int(text[start : start + 2], 16) / 255
     return colours[regions.class_code]
 
 
