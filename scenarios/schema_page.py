@@ -10,7 +10,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from scenarios.schema import AlbedoSection, Block, Scenario
+from scenarios.schema import Scenario
+from scenarios.sections import AlbedoSection, Block
 from scenarios.world.components import KINDS
 
 _HEAD = """\

@@ -8,7 +8,7 @@ import numpy as np
 
 from perception.records import FloatArray, Grid, Progress
 from scenarios.benchmarks import Row, Table
-from scenarios.schema import SonarSection, WorldSection
+from scenarios.sections import SonarSection, WorldSection
 from scenarios.sonar.echoes import SonarModel, facet_echoes, sonar_model
 from scenarios.world.build import build_world
 from scenarios.world.components import Fractal

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from perception.records import FloatArray, InputError
-from scenarios.schema import Block, MissionSection, WorldSection
+from scenarios.sections import Block, MissionSection, WorldSection
 
 Line = tuple[float, float, float, float]
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.ndimage import uniform_filter1d
 
 from perception.records import FloatArray, Grid, Progress, silent
-from scenarios.schema import SonarSection
+from scenarios.sections import SonarSection
 from scenarios.sonar import beams, kernel
 
 # The flat floor at two thirds of the range gives this many counts of 65535.

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from perception.records import FloatArray, Grid, InputError
 from scenarios.missions.lines import Path
-from scenarios.schema import VehicleSection, WorldSection
+from scenarios.sections import VehicleSection, WorldSection
 
 
 @dataclass(frozen=True, slots=True)

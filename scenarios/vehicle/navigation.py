@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perception.records import FloatArray
-from scenarios.schema import NavigationSection
+from scenarios.sections import NavigationSection
 from scenarios.vehicle.motion import Motion
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from perception.records import FloatArray, Grid, InputError
-from scenarios.schema import AlbedoSection, WorldSection
+from scenarios.sections import AlbedoSection, WorldSection
 from scenarios.world import components, shapes
 from scenarios.world.fields import spectral_field
 from scenarios.world.objects import SeaObject, add_box, add_round, scatter

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from perception.records import FloatArray, Grid
-from scenarios.schema import PriorSection, WorldSection
+from scenarios.sections import PriorSection, WorldSection
 from scenarios.world.build import frame_of
 from scenarios.world.fields import spectral_field
 

@@ -81,3 +81,14 @@ def test_the_page_of_keys_lists_every_key_with_unit_default_and_meaning():
     assert page.read_text(encoding="utf-8") == schema_page(), (
         "remake it: python -m scenarios.schema_page > docs/scenarios.md"
     )
+
+
+def test_a_sonar_s_sheet_fills_what_is_not_given():
+    tree = {**LINE, "sonar": {"model": "starfish-453", "range_m": 50.0}}
+    sonar = scenario_of(tree, "test").sonar
+    assert (sonar.frequency_khz, sonar.horizontal_beam_deg, sonar.vertical_beam_deg) == (450, 2, 60)
+    assert (sonar.range_m, sonar.samples) == (50.0, 2000)
+    # Resolved, it says the same again.
+    assert scenario_of(tree_of(scenario_of(tree, "test")), "again").sonar == sonar
+    message = complaint({"sonar": {"model": "whiskers"}})
+    assert "sonar" in message and "whiskers" in message and "starfish-453" in message

@@ -7,7 +7,7 @@ from scipy.integrate import quad
 
 from perception.records import Grid
 from scenarios.benchmarks.simulation import plain_echo
-from scenarios.schema import SonarSection
+from scenarios.sections import SonarSection
 from scenarios.sonar import beams, kernel
 from scenarios.sonar.echoes import facet_echoes, sonar_model
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from scenarios.schema import SonarSection
+from scenarios.sections import SonarSection
 from scenarios.sonar import kernel
 from scenarios.sonar.echoes import record, sonar_model
 

@@ -6,7 +6,13 @@ from numpy.testing import assert_allclose
 
 from perception.records import Grid, InputError
 from scenarios.missions.lines import path_along, survey_lines
-from scenarios.schema import Block, MissionSection, NavigationSection, VehicleSection, WorldSection
+from scenarios.sections import (
+    Block,
+    MissionSection,
+    NavigationSection,
+    VehicleSection,
+    WorldSection,
+)
 from scenarios.vehicle.motion import at_times, coloured, fly, sonar_poses
 from scenarios.vehicle.navigation import dead_reckon, read_instruments, surface_fixes, tide_m
 from scenarios.vehicle.soundings import beam_ranges, rotation_to_map

@@ -6,7 +6,8 @@ from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter
 
 from perception.records import Grid, InputError
-from scenarios.schema import PriorSection, WorldSection, scenario_of
+from scenarios.schema import scenario_of
+from scenarios.sections import PriorSection, WorldSection
 from scenarios.world.build import build_world, frame_of
 from scenarios.world.fields import spectral_field
 from scenarios.world.prior import block_mean, prior_map
