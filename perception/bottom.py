@@ -221,7 +221,7 @@ def _change_cost(
     return cost.astype(np.float32)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True, nogil=True)
 def _least_cost_path(cost, jump_cost):  # type: ignore[no-untyped-def]
     """Return the column per row (n,) that minimises cost plus `jump_cost` per column moved.
 

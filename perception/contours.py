@@ -95,9 +95,10 @@ def learn_roughness(
     if len(floor) < 8 or np.ptp(along) <= 0:
         return Roughness(1e-3, 1.0)
     noise = float(np.median(np.square(sigma_m[known])))
-    step = np.ptp(along) / (len(along) - 1)
+    length = float(along[-1] - along[0])
+    step = length / (len(along) - 1)
     even = np.interp(np.arange(along[0], along[-1], step), along, floor)
-    top = min(max(reach_m, 4 * step), 0.5 * np.ptp(along))
+    top = min(max(reach_m, 4 * step), 0.5 * length)
     lags = np.unique(np.geomspace(1, max(2, top / step), 14).astype(int))
     lags = lags[lags < len(even)]
     values = np.array([0.5 * np.mean(np.square(even[k:] - even[:-k])) for k in lags])

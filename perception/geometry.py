@@ -65,7 +65,7 @@ def _smooth(values: FloatArray, window: int) -> FloatArray:
     return np.convolve(padded, np.full(window, 1.0 / window), mode="valid")
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True, nogil=True)
 def resample_rows(power, sample_m, common_m, n_out):  # type: ignore[no-untyped-def]
     """Resample each row of `power` (n, m) from its own `sample_m` (n,) to `common_m`, linearly.
 

@@ -111,7 +111,7 @@ def independent_part(ratio: FloatArray) -> float:
     return float(1 / (1 + 2 * total))
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True, nogil=True)
 def _unary(ratio, bounds, weight):  # type: ignore[no-untyped-def]
     """Return minus log likelihood (n, m, 3) of shadow, nominal, highlight, limited, times `weight`.
 
@@ -143,7 +143,7 @@ def _unary(ratio, bounds, weight):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True, nogil=True)
 def _aggregate(cost, change_cost):  # type: ignore[no-untyped-def]
     """Sum the least path costs (n, m, 3) arriving at every sample from eight directions.
 
@@ -182,7 +182,7 @@ def _aggregate(cost, change_cost):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator, unused-ignore]
+@njit(cache=True, nogil=True)
 def _decide(total, ratio):  # type: ignore[no-untyped-def]
     """Return the label (n, m) of least total cost; -2 without data."""
     n, m, _ = total.shape

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -38,11 +39,11 @@ class ObjectConfig:
     shape_sigma : what the family of shapes leaves open, as a part of the height.
     """
 
-    min_samples: int = 5
+    min_samples: int = 6
     min_pings: int = 2
-    min_cells: int = 16
-    min_gain: float = 25.0
-    shape_sigma: float = 0.03
+    min_cells: int = 20
+    min_gain: float = 30.0
+    shape_sigma: float = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +84,11 @@ class ObjectTable:
     @classmethod
     def of(cls, rows: list[ObjectRow]) -> ObjectTable:
         """Stack rows into a table; none give an empty one."""
-        columns = {
-            f.name: tuple(r.kind for r in rows) if f.name == "kind"
-            else np.array([getattr(r, f.name) for r in rows],
-                          dtype=np.int64 if f.name in ("pass_index", "ping") else float)
-            for f in fields(cls)
-        }  # fmt: skip
+        columns: dict[str, Any] = {}
+        for f in fields(cls):
+            values = [getattr(row, f.name) for row in rows]
+            whole = np.int64 if f.name in ("pass_index", "ping") else np.float64
+            columns[f.name] = tuple(values) if f.name == "kind" else np.array(values, dtype=whole)
         return cls(**columns)
 
     @classmethod
@@ -96,13 +96,11 @@ class ObjectTable:
         """Join the tables of several passes."""
         if not tables:
             return cls.of([])
-        return cls(
-            **{
-                f.name: sum((t.kind for t in tables), ()) if f.name == "kind"
-                else np.concatenate([getattr(t, f.name) for t in tables])
-                for f in fields(cls)
-            }
-        )  # fmt: skip
+        columns: dict[str, Any] = {}
+        for f in fields(cls):
+            parts = [getattr(table, f.name) for table in tables]
+            columns[f.name] = sum(parts, ()) if f.name == "kind" else np.concatenate(parts)
+        return cls(**columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +233,7 @@ def _measure(
     start_m, end_m = shadow.start[peak] * sample_m, shadow.end[peak] * sample_m
     if not start_m > drop * 1.0001:
         return None
-    order = _order_evidence(shadow, ratio, levels.looks)
+    order = _order_evidence(shadow, ratio, levels.looks * levels.independent)
     starts = _starts(shadow, start_m, end_m, drop, track)
     if abs(order) > _SURE_ORDER:
         starts = [start for start in starts if start[0] * order > 0]
@@ -288,7 +286,7 @@ def _peak_row(shadow: _Shadow) -> int:
 
 # Beyond this many standard deviations the order of levels alone settles the kind; below, each counts for this
 # much log likelihood.
-_SURE_ORDER, _ORDER_WEIGHT = 4.0, 3.0
+_SURE_ORDER, _ORDER_WEIGHT = 3.0, 3.0
 
 # A patch is averaged down to at most this many lines and bins: the fit's cost is their product.
 _PATCH_LINES, _PATCH_BINS = 24, 110

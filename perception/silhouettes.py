@@ -88,9 +88,9 @@ def predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, fa
 
 
 @njit(cache=True, nogil=True)
-def _trace(
+def _trace(  # type: ignore[no-untyped-def]
     row, x_low, x_high, dy, x0, sx, height, beta, corner, kappa, drop, start_m, step_m, facet_m
-):  # type: ignore[no-untyped-def]
+):
     """Sum the lit facets of one line into `row`; return the ground range where the flat floor is lit again."""
     count = min(max(int((x_high - x_low) / facet_m) + 1, 16), 600)
     dx = (x_high - x_low) / count
@@ -170,9 +170,9 @@ def _soft(mean, cap):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def fisher_step(
+def fisher_step(  # type: ignore[no-untyped-def]
     parameters, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
-):  # type: ignore[no-untyped-def]
+):
     """Return the log likelihood, its gradient (7,) and Fisher information (7, 7) of one patch.
 
     Samples are Gamma with the model's mean; data above `cap` are censored and the mean is compressed
@@ -226,9 +226,9 @@ def fisher_step(
 
 
 @njit(cache=True, nogil=True)
-def log_likelihood(
+def log_likelihood(  # type: ignore[no-untyped-def]
     parameters, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
-):  # type: ignore[no-untyped-def]
+):
     """Return the log likelihood of one patch, as `fisher_step` has it."""
     n, m = ratio.shape
     base = np.empty((n, m))

@@ -6,6 +6,7 @@ bottom track -> equalised echo -> levels -> shadows and objects -> levelled cont
 from __future__ import annotations
 
 import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +15,7 @@ from perception.bottom import BottomConfig, BottomTrack, track_bottom
 from perception.contours import Roughness, floor_beside, learn_roughness, level_lines
 from perception.gain import Equalised, GainConfig, equalise
 from perception.geometry import ground_range, progress_along, resample_rows
-from perception.levels import NO_DATA, SHADOW, LevelConfig, Levels, segment_levels
+from perception.levels import SHADOW, LevelConfig, Levels, segment_levels
 from perception.objects import ObjectConfig, ObjectRow, ObjectTable, Track, find_objects
 from perception.records import ElevationStrip, FloatArray, InputError, IntArray, Swath
 
@@ -96,18 +97,28 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
     reach = sample_m * port.shape[1]
     rough = learn_roughness(sounded, bottom.sigma_m, along_m, reach)
     line_m, line_sigma = level_lines(sounded, bottom.sigma_m, along_m, rough)
+    # Where within its sample the first echo began is the same unknown on every line: averaging many does
+    # not take it away.
+    line_sigma = np.hypot(line_sigma, 0.3 * sample_m)
     altitude_m = -depth_m - line_m
     level = BottomTrack(altitude_m, line_sigma, bottom.first_return_m, bottom.valid)
     track = Track(along_m, altitude_m, line_sigma, swath.easting_m, swath.northing_m,
                   swath.heading_rad, swath.ping)  # fmt: skip
-    sides, rows = [], []
-    for side, power in ((-1, port), (1, starboard)):
+    floor_sigma = _floor_sigma(rough, sample_m, port.shape[1], altitude_m)
+
+    def one_side(side: int, power: FloatArray) -> tuple[Equalised, Levels, list[ObjectRow]]:
         equalised = equalise(power, sample_m, bottom.first_return_m, altitude_m,
                              side * swath.roll_rad, config.gain)  # fmt: skip
         levels = segment_levels(equalised.ratio, equalised.looks, config.levels)
-        rows += find_objects(equalised.ratio, levels, sample_m, side, track, swath.pass_index,
-                             _floor_sigma(rough, sample_m, power.shape[1], altitude_m), config.objects)  # fmt: skip
-        sides.append((equalised, levels))
+        found = find_objects(equalised.ratio, levels, sample_m, side, track, swath.pass_index,
+                             floor_sigma, config.objects)  # fmt: skip
+        return equalised, levels, found
+
+    # Both sides at once: the kernels let go of the interpreter's lock, and share nothing.
+    with ThreadPoolExecutor(2) as pool:
+        done = list(pool.map(one_side, (-1, 1), (port, starboard)))
+    sides = [(equalised, levels) for equalised, levels, _ in done]
+    rows = [row for _, _, found in done for row in found]
     rows.sort(key=lambda row: row.ping)
     strip = _strip(
         swath, level, along_m, depth_m, line_m, line_sigma, sides, sample_m, rough, rows, config
@@ -165,7 +176,7 @@ def _floor_sigma(
 ) -> FloatArray:
     """Return the 1-sigma (count,) of the floor at each slant sample against the floor below the sonar."""
     slant = (np.arange(count) + 0.5) * sample_m
-    ground = np.nan_to_num(ground_range(slant, np.median(altitude_m)), nan=0.0)
+    ground = np.nan_to_num(ground_range(slant, np.array(np.median(altitude_m))), nan=0.0)
     return np.sqrt(rough.variogram(ground))
 
 
@@ -270,7 +281,10 @@ def _on_columns(
         )
         label = np.take_along_axis(levels.label, middle, 1)
         shadow[:, columns] = inside & (label == SHADOW)
-        seen[:, columns] = inside | ((label != NO_DATA) & (outer <= width + 1))
+        # Ground before the first echo (on a slope, or beside nadir) is floor all the same; ground past the last
+        # sample of its ping is not.
+        last = np.where(known.any(axis=1), width - known[:, ::-1].argmax(axis=1), 0)
+        seen[:, columns] = outer <= last[:, None] + 1
     return echo, shadow, seen
 
 
