@@ -3,7 +3,8 @@
 Recorders store port near to far or far to near and no header field says which. The echoes do: beside
 the vehicle lies the water column, quiet but for the transmit pulse, and it ends in the abrupt first
 return of the bottom. From the far end the level rises inward gradually. So each ping is asked, from
-either end, for the greatest step from "everything so far is quiet" to "loud".
+either end, for the greatest step from "everything so far is quiet" to "loud". Levels are compared by
+their rank within the ping, so it does not matter whether a recorder stores amplitude, power or decibels.
 """
 
 from __future__ import annotations
@@ -12,17 +13,20 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from perception.records import FloatArray
+from perception.records import BoolArray, FloatArray
 
-_BLOCKS = 128  # a ping is judged by this many block means: speckle of one look averages to ~10 %
-_AFTER = 6  # blocks after a candidate edge: 5 % of the range, as long as a first return is loud
-_SKIP = 2  # blocks at the very end that may hold the transmit pulse or a marker
-_DEEPEST = 96  # an edge is looked for in the first three quarters of the row
-_SURE = 0.5  # nepers of level by which one end must beat the other
+_FINE = 512  # blocks a ping is cut into: the water column of a low flyer is 2 % of its range
+_COARSE = 128  # four fine ones each: speckle of one look averages out
+_AFTER = 6  # blocks after a candidate edge: as long as a first return is surely loud
+_DEEPEST = 0.75  # an edge is looked for in this part of the row
+_PULSE_COARSE, _PULSE_FINE = 2, 5  # blocks at the very end that may hold the transmit pulse
+_SURE = 0.12  # of the ranks, by which one end must beat the other
+_AGREEING = 0.7  # of the pings, that must say the same
+_LEAST_SAMPLES = 32
 
 
 def near_end_evidence(rows: Iterable[FloatArray], hint_fraction: Iterable[float]) -> float:
-    """Return the evidence, in nepers of level, that rows are stored near to far.
+    """Return the evidence, as a difference of ranks in [-1, 1], that rows are stored near to far.
 
     Parameters
     ----------
@@ -36,26 +40,22 @@ def near_end_evidence(rows: Iterable[FloatArray], hint_fraction: Iterable[float]
         Positive near to far, negative far to near, 0 undecided.
     """
     judged = [
-        (level, fraction)
-        for level, fraction in zip(map(_block_levels, rows), hint_fraction, strict=True)
-        if level is not None
+        (np.asarray(row, float), fraction)
+        for row, fraction in zip(rows, hint_fraction, strict=True)
+        if len(row) >= _LEAST_SAMPLES and np.any(np.nan_to_num(row))
     ]
     if not judged:
         return 0.0
-    levels = np.array([level for level, _ in judged])
-    gains = _rises(levels).max(axis=1) - _rises(levels[:, ::-1]).max(axis=1)
-    evidence = float(np.median(gains))
-    agreeing = float(np.mean(np.sign(gains) == np.sign(evidence)))
-    if abs(evidence) >= _SURE and agreeing >= 0.7:
-        return evidence
-    hinted = [
-        _step_at(level, round(fraction * _BLOCKS))
-        - _step_at(level[::-1], round(fraction * _BLOCKS))
-        for level, fraction in judged
-        if np.isfinite(fraction) and 0.02 < fraction < 0.9
-    ]
-    by_hint = float(np.median(hinted)) if hinted else 0.0
-    return by_hint if abs(by_hint) >= _SURE else 0.0
+    cut = _padding([row for row, _ in judged])
+    trimmed = [row[cut[0] : len(row) - cut[1]] for row, _ in judged]
+    evidence = _decided(_gains(trimmed))
+    if evidence == 0.0 and max(cut) > 0 and min(cut) == 0:
+        # Blank samples at one end, and no water column at the other: they are the water column.
+        return 1.0 if cut[0] else -1.0
+    if evidence == 0.0:
+        ranks = np.array([_ranks(row) for row, _ in judged])
+        evidence = _decided(_hinted(ranks, np.array([fraction for _, fraction in judged])))
+    return evidence
 
 
 def first_return_fractions(rows: Iterable[FloatArray]) -> FloatArray:
@@ -63,43 +63,98 @@ def first_return_fractions(rows: Iterable[FloatArray]) -> FloatArray:
 
     A crude first return, for telling whether an altitude field can be true; NaN where no step shows.
     """
-    levels = [_block_levels(row) for row in rows]
-    out = np.full(len(levels), np.nan)
-    known = [i for i, level in enumerate(levels) if level is not None]
+    kept = [np.asarray(row, float) for row in rows]
+    out = np.full(len(kept), np.nan)
+    known = [i for i, r in enumerate(kept) if len(r) >= _LEAST_SAMPLES and np.any(np.nan_to_num(r))]
     if known:
-        rises = _rises(np.array([levels[i] for i in known]), after=2)
+        coarse = _coarse(np.array([_ranks(kept[i]) for i in known]))
+        rises = _rises(coarse, _PULSE_COARSE, after=2)
         step = rises.max(axis=1)
-        # The first rise that is most of the greatest: speckle puts the greatest some blocks later.
-        at = (rises > 0.6 * step[:, None]).argmax(axis=1) + _SKIP + 2.0
-        out[known] = np.where(step > _SURE, at / _BLOCKS, np.nan)
+        # The first rise that is half of the greatest: speckle puts the greatest some blocks later.
+        at = (rises > 0.5 * step[:, None]).argmax(axis=1) + _PULSE_COARSE + 2.0
+        out[known] = np.where(step > 2 * _SURE, at / _COARSE, np.nan)
     return out
 
 
-def _block_levels(row: FloatArray) -> FloatArray | None:
-    """Return the log of the row's block means (128,); None where the row holds no echo."""
-    row = np.where(np.isfinite(row), np.abs(row), 0.0).astype(float)
-    mean = row.mean() if len(row) >= _BLOCKS // 4 else 0.0
-    if mean <= 0:
-        return None
-    edges = np.linspace(0, len(row), min(_BLOCKS, len(row)) + 1).astype(np.int64)
+def _padding(rows: list[FloatArray]) -> tuple[int, int]:
+    """Return the samples at the start and at the end that are blank (exactly zero) in all rows."""
+
+    def blank(row: FloatArray) -> int:
+        filled = np.flatnonzero(np.nan_to_num(row))
+        return int(filled[0]) if len(filled) else len(row)
+
+    ends = np.array([(blank(row), blank(row[::-1])) for row in rows])
+    shortest = min(len(row) for row in rows)
+    start, stop = (int(v) for v in ends.min(axis=0))
+    if start + stop > shortest - _LEAST_SAMPLES:
+        return 0, 0
+    # A blank sample or two at an end is a marker, not padding.
+    return start if start > 2 else 0, stop if stop > 2 else 0
+
+
+def _gains(rows: list[FloatArray]) -> FloatArray:
+    """Return how much the greatest step from the stored start beats the one from the stored end."""
+    ranks = np.array([_ranks(row) for row in rows])
+    return _best_step(ranks) - _best_step(ranks[:, ::-1])
+
+
+def _decided(gains: FloatArray) -> float:
+    gains = gains[np.isfinite(gains)]
+    if len(gains) == 0:
+        return 0.0
+    evidence = float(np.median(gains))
+    agreeing = float(np.mean(np.sign(gains) == np.sign(evidence)))
+    return evidence if abs(evidence) >= _SURE and agreeing >= _AGREEING else 0.0
+
+
+def _ranks(row: FloatArray) -> FloatArray:
+    """Return the ranks in [0, 1] of the row's block means (`_FINE`,)."""
+    row = np.where(np.isfinite(row), np.abs(row), 0.0)
+    edges = np.linspace(0, len(row), min(_FINE, len(row)) + 1).astype(np.int64)
     blocks = np.add.reduceat(row, edges[:-1]) / np.diff(edges)
-    if len(blocks) < _BLOCKS:
-        blocks = np.interp(np.linspace(0, 1, _BLOCKS), np.linspace(0, 1, len(blocks)), blocks)
-    # A floor of a thousandth of the mean keeps noiseless water columns (exact zeros) finite.
-    return np.asarray(np.log(blocks + 1e-3 * mean))
+    # Equal levels (blank water, a saturated pulse) share their mean rank: they are no step.
+    _, inverse, counts = np.unique(blocks, return_inverse=True, return_counts=True)
+    ranks = ((np.cumsum(counts) - (counts + 1) / 2) / max(len(blocks) - 1, 1))[inverse]
+    if len(ranks) < _FINE:
+        ranks = np.interp(np.linspace(0, 1, _FINE), np.linspace(0, 1, len(ranks)), ranks)
+    return np.asarray(ranks)
 
 
-def _rises(levels: FloatArray, after: int = _AFTER) -> FloatArray:
+def _coarse(ranks: FloatArray) -> FloatArray:
+    return np.asarray(ranks.reshape(len(ranks), _COARSE, -1).mean(axis=2))
+
+
+def _best_step(ranks: FloatArray) -> FloatArray:
+    """Return the greatest step (n,) over the whole row, or over its first quarter seen finely."""
+    whole = _rises(_coarse(ranks), _PULSE_COARSE).max(axis=1)
+    close = _rises(ranks[:, : _FINE // 4], _PULSE_FINE).max(axis=1)
+    return np.asarray(np.maximum(whole, close))
+
+
+def _rises(ranks: FloatArray, skip: int, after: int = _AFTER) -> FloatArray:
     """Return the rise (n, candidates) from the upper quartile of all before to the mean just after."""
-    rises = np.empty((len(levels), _DEEPEST - _SKIP - 2))
-    for column, at in enumerate(range(_SKIP + 2, _DEEPEST)):
-        rank = (at - _SKIP) * 3 // 4
-        before = np.partition(levels[:, _SKIP:at], rank, axis=1)[:, rank]
-        rises[:, column] = levels[:, at : at + after].mean(axis=1) - before
+    deepest = int(_DEEPEST * ranks.shape[1])
+    rises = np.empty((len(ranks), deepest - skip - 2))
+    for column, at in enumerate(range(skip + 2, deepest)):
+        rank = (at - skip) * 3 // 4
+        before = np.partition(ranks[:, skip:at], rank, axis=1)[:, rank]
+        rises[:, column] = ranks[:, at : at + after].mean(axis=1) - before
     return rises
+
+
+def _hinted(ranks: FloatArray, fraction: FloatArray) -> FloatArray:
+    """Return how much the step at the altitude field's place from one end beats that from the other."""
+    coarse = _coarse(ranks)
+    with np.errstate(invalid="ignore"):
+        known: BoolArray = (fraction > 0.02) & (fraction < 0.9)
+    gains = np.full(len(ranks), np.nan)
+    for i in np.flatnonzero(known):
+        at = round(float(fraction[i]) * _COARSE)
+        gains[i] = _step_at(coarse[i], at) - _step_at(coarse[i, ::-1], at)
+    return gains
 
 
 def _step_at(level: FloatArray, at: int) -> float:
     """Return the rise at a block from a little before to a little after."""
-    before = level[max(at - 2 * _AFTER, _SKIP) : max(at - 1, _SKIP + 1)]
+    before = level[max(at - 2 * _AFTER, _PULSE_COARSE) : max(at - 1, _PULSE_COARSE + 1)]
     return float(level[at : at + 2 * _AFTER].mean() - before.mean())

