@@ -20,8 +20,11 @@ from scenarios.commands.console import (
 @click.argument("scenario")
 @out_option
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed, not the scenario's.")
+@click.option("--picture", is_flag=True, help="Draw truth/simulation.png too.")
 @common_options
-def command(scenario: str, out: Path, seed: int | None, quiet: bool, verbose: bool) -> None:
+def command(
+    scenario: str, out: Path, seed: int | None, picture: bool, quiet: bool, verbose: bool
+) -> None:
     """Simulate SCENARIO, a TOML file or a name that `bathynav scenarios` lists.
 
     \b
@@ -41,6 +44,10 @@ def command(scenario: str, out: Path, seed: int | None, quiet: bool, verbose: bo
     with progress_bars(quiet) as progress:
         simulation = simulate(config, progress)
         write_simulation(simulation, out, progress)
+    if picture:
+        from scenarios.plots_simulation import plot_simulation
+
+        plot_simulation(out / "truth" / "simulation.png", simulation)
     metrics = summary(simulation)
     write_metrics(out, metrics, tree_of(config), seed=config.seed)
     if not quiet:

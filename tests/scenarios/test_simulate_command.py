@@ -250,3 +250,11 @@ def test_a_tide_is_written_for_map_and_moves_the_depth_only(tmp_path):
     tidal = simulate(tiny("demo", navigation=tide)).survey
     assert (calm.truth.elevation_m == tidal.truth.elevation_m).all()
     assert np.abs(calm.estimate.depth_m - tidal.estimate.depth_m).max() > 0.5
+
+
+def test_a_picture_is_drawn_on_request_beside_the_truth(tmp_path, run):
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(tree_of(tiny("demo"))))
+    out = tmp_path / "out"
+    status, printed, _ = run("simulate", str(tmp_path / "s.toml"), "--out", str(out), "--picture")
+    assert status == 0 and "pings" in printed
+    assert (out / "truth/simulation.png").read_bytes().startswith(b"\x89PNG")
