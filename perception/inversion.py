@@ -17,12 +17,18 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import ndimage
 
+from perception.first_return import first_return_lead
 from perception.gain_basis import GainBasis
 from perception.posterior import Problem, Spectrum, dual_features
 from perception.rays import Look, Rays, Soundings, stack_rays, stack_soundings
 from perception.records import BoolArray, FloatArray, Grid, InputError, Progress, silent
+from perception.roughness import learn_roughness
 from perception.shading import Rows, trace
-from perception.soundings import Equations, join, learn_roughness, sounding_equations
+from perception.soundings import (
+    Equations,
+    join,
+    sounding_equations,
+)
 
 __all__ = ["InversionConfig", "InversionResult", "Look", "invert"]
 
@@ -46,7 +52,7 @@ class InversionConfig:
     max_cells : nodes beyond which a cell that was not asked for is enlarged.
     """
 
-    iterations: int = 6
+    iterations: int = 5
     exponent: float = 2.0
     least_sigma: float = 0.2
     albedo_sigma: float = 0.35
@@ -97,6 +103,8 @@ class _State:
     albedo: FloatArray
     gain: FloatArray
     config: InversionConfig
+    lead_m: FloatArray | float = 0.0
+    lead_sigma_m: float = 0.0
     residual: list[float] = field(default_factory=list)
     step_m: list[float] = field(default_factory=list)
 
@@ -125,20 +133,27 @@ def invert(
     """
     config = config or InversionConfig()
     rng = rng or np.random.default_rng(0)
-    state = _prepare(looks, cell_m, config)
+    state = _prepare(looks, cell_m, config, rng)
     total = config.iterations + 2
     progress("joint inversion", 1, total)
-    problem, passed, rows = _iterate(state, progress, total)
+    problem, passed, rows = _iterate(state, progress, total, rng)
     sigma = _posterior_sigma(problem, state, rng)
     progress("joint inversion", total, total)
     return _result(state, sigma, passed, rows, crs or looks[0].swath.crs)
 
 
-def _prepare(looks: Sequence[Look], cell_m: float | None, config: InversionConfig) -> _State:
+def _prepare(
+    looks: Sequence[Look],
+    cell_m: float | None,
+    config: InversionConfig,
+    rng: np.random.Generator,
+) -> _State:
     cell = cell_m or _natural_cell(looks)
     rays = [ray for i, look in enumerate(looks) for ray in stack_rays(look, i, cell)]
     bottoms = [
-        b for look in looks if (b := stack_soundings(look, cell, config.sounding_sigma_m)) is not None
+        b
+        for look in looks
+        if (b := stack_soundings(look, cell, config.sounding_sigma_m)) is not None
     ]
     if not bottoms:
         raise InputError(
@@ -151,7 +166,7 @@ def _prepare(looks: Sequence[Look], cell_m: float | None, config: InversionConfi
             cell *= 2
             west, south, shape = _frame(rays, bottoms, cell)
     bottom = join(bottoms)
-    roughness = learn_roughness(bottoms, float(np.median(bottom.sigma_m)) / 2, cell)
+    roughness = learn_roughness(bottoms, float(np.median(bottom.sigma_m)) / 2, cell, rng)
     reach = max((ray.reach_m for ray in rays), default=1.0)
     basis = GainBasis(reach)
     mean = float(np.mean(bottom.up_m - bottom.range_m))
@@ -253,7 +268,7 @@ def _problem(state: _State, data: _Data | None, equations: Equations) -> Problem
 
 
 def _iterate(
-    state: _State, progress: Progress, total: int
+    state: _State, progress: Progress, total: int, rng: np.random.Generator
 ) -> tuple[Problem, BoolArray, Rows]:
     """Relinearise and solve until the surface stands still."""
     for k in range(state.config.iterations):
@@ -261,9 +276,13 @@ def _iterate(
             state.surface, state.west_m, state.south_m, state.cell_m, state.rays,
             state.config.exponent,
         )  # fmt: skip
+        # On the soundings' surface nothing hides; what other passes see is known after a step.
+        if k in (0, 2):
+            _learn_lead(state, rows, rng)
         data = _linearise(state, rows, first=k == 0)
         equations = sounding_equations(
-            state.surface, state.west_m, state.south_m, state.cell_m, state.soundings, below=False
+            state.surface, state.west_m, state.south_m, state.cell_m, state.soundings,
+            lead_m=state.lead_m, lead_sigma_m=state.lead_sigma_m,
         )
         problem = _problem(state, data, equations)
         fields = (state.surface, state.albedo, state.gain)
@@ -281,6 +300,31 @@ def _iterate(
         if step < 0.02:
             break
     return problem, passed, rows
+
+
+def _learn_lead(state: _State, rows: Rows, rng: np.random.Generator) -> None:
+    """Find by how much first returns lead; less where other passes resolve the floor below a track."""
+    bottom, config = state.soundings, state.config
+    col = np.clip((bottom.easting_m - state.west_m) / state.cell_m, 0, state.shape[1] - 2)
+    row = np.clip((bottom.northing_m - state.south_m) / state.cell_m, 0, state.shape[0] - 2)
+    below = np.unique(row.astype(np.int64) * (state.shape[1] - 1) + col.astype(np.int64))
+    duals = (state.shape[0] - 1) * (state.shape[1] - 1)
+    far = np.bincount(rows.cell[rows.ground_m > rows.drop_m], minlength=duals)
+    # Two looks tell slope from albedo.
+    seen = float(np.mean(np.minimum(far[below], 2))) / 2
+    altitude = float(np.median(bottom.range_m))
+    lead = spread = 0.0
+    for part, resolved in ((seen, True), (1 - seen, False)):
+        if part > 0.02:
+            mean, sigma = first_return_lead(
+                state.roughness, altitude, config.nadir * altitude,
+                float(np.median(bottom.sigma_m)), state.cell_m, resolved, rng,
+            )  # fmt: skip
+            lead, spread = lead + part * mean, sigma
+    state.lead_m, state.lead_sigma_m = lead, spread
+    logger.info(
+        "first returns lead by %.3f +- %.3f m, %.0f %% seen by other passes", lead, spread, 100 * seen
+    )
 
 
 def _linearise(state: _State, rows: Rows, first: bool) -> _Data:
@@ -340,15 +384,19 @@ def _scale_by_angle(residual: FloatArray, angle_rad: FloatArray) -> FloatArray:
     return np.maximum(scale, 1e-3)
 
 
+def _sample(problem: Problem, state: _State, rng: np.random.Generator) -> FloatArray:
+    """Draw a deviation of the surface from the posterior."""
+    zero = (np.zeros(state.shape), np.zeros(state.shape), np.zeros(state.basis.size))
+    solution, _ = problem.solve(zero, problem.perturbation(rng), tolerance=3e-2, most=20)
+    return solution[0]
+
+
 def _posterior_sigma(problem: Problem, state: _State, rng: np.random.Generator) -> FloatArray:
     """Return the 1-sigma of the heights from solutions of perturbed problems."""
     total = np.zeros(state.shape)
     n = state.config.samples
     for _ in range(n):
-        right = problem.perturbation(rng)
-        zero = (np.zeros(state.shape), np.zeros(state.shape), np.zeros(state.basis.size))
-        sample, _ = problem.solve(zero, right, tolerance=3e-2, most=25)
-        total += sample[0] ** 2
+        total += _sample(problem, state, rng) ** 2
     # Few samples: neighbours lend theirs, the spread varies slowly.
     return np.sqrt(ndimage.uniform_filter(total / max(n, 1), 5, mode="nearest"))
 

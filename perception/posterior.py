@@ -222,7 +222,7 @@ class Level:
             y_z, y_a = self.apply(z, a)
             y_z /= self.diagonal[0]
             y_a /= self.diagonal[1]
-            value = float(np.sqrt((np.vdot(y_z, y_z) + np.vdot(y_a, y_a))))
+            value = float(np.sqrt(np.vdot(y_z, y_z) + np.vdot(y_a, y_a)))
             z, a = y_z / value, y_a / value
         return 1.15 * value
 
@@ -310,9 +310,7 @@ class Hierarchy:
             )  # fmt: skip
             nodes = (moments.shape[1] + 1, moments.shape[2] + 1)
             coarse_rows = sparse.csr_matrix(fine.rows @ _prolongation_matrix(*nodes))
-            levels.append(
-                Level(2 * fine.cell_m, moments, height, albedo, coarse_rows, row_weight)
-            )
+            levels.append(Level(2 * fine.cell_m, moments, height, albedo, coarse_rows, row_weight))
         return cls(levels)
 
     def cycle(self, b_z: FloatArray, b_a: FloatArray, at: int = 0) -> tuple[FloatArray, FloatArray]:
@@ -408,9 +406,7 @@ class Problem:
     def __post_init__(self) -> None:
         rows, cols = self.shape
         moments = np.zeros((10, (rows - 1) * (cols - 1)))
-        accumulate_moments(
-            self.cell, self.weight, self.c_east, self.c_north, self.c_level, moments
-        )
+        accumulate_moments(self.cell, self.weight, self.c_east, self.c_north, self.c_level, moments)
         self.hierarchy = Hierarchy.build(
             self.cell_m, moments.reshape(10, rows - 1, cols - 1), self.height, self.albedo,
             self.rows, self.row_weight,
@@ -459,9 +455,7 @@ class Problem:
         b_g = np.bincount(self.knot.ravel(), (v[:, None] * self.share).ravel(), n)
         return b_z, b_a, b_g
 
-    def perturbation(
-        self, rng: np.random.Generator
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def perturbation(self, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Draw a right-hand side whose solution is a sample of the posterior about zero.
 
         Every squared term of the cost, data and prior, gives its own derivative times unit noise.

@@ -34,7 +34,9 @@ class Look:
         for name in ("altitude_m", "altitude_sigma_m", "usable"):
             value = getattr(self, name)
             if value is not None and len(value) != n:
-                raise ValueError(f"Look.{name} must have one value per ping ({n}), got {len(value)}")
+                raise ValueError(
+                    f"Look.{name} must have one value per ping ({n}), got {len(value)}"
+                )
         for name in ("shadow_port", "shadow_starboard"):
             value = getattr(self, name)
             if value is not None and value.shape != self.swath.port.shape:
@@ -171,9 +173,7 @@ def _stacked_power(echo: FloatArray, chosen: IntArray) -> FloatArray:
 def stack_soundings(look: Look, cell_m: float, floor_sigma_m: float) -> Soundings | None:
     """Return the bottom track, averaged over about a cell of track; None where there is none."""
     swath = look.swath
-    good = np.flatnonzero(
-        usable_pings(look) & np.isfinite(look.altitude_m) & (look.altitude_m > 0)
-    )
+    good = np.flatnonzero(usable_pings(look) & np.isfinite(look.altitude_m) & (look.altitude_m > 0))
     size = max(1, round(cell_m / ping_spacing_m(swath)))
     n = len(good) // size
     if n == 0:

@@ -95,7 +95,9 @@ def trace(
     rows, cols = surface.shape
     sums = np.zeros(((rows - 1) * (cols - 1), len(_COLUMNS) + 1))
     passed = np.zeros((rows - 1) * (cols - 1), np.bool_)
-    parts: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in (*_COLUMNS, "cell", "samples", "side", "look")}
+    parts: dict[str, list[npt.NDArray[Any]]] = {
+        name: [] for name in (*_COLUMNS, "cell", "samples", "side", "look")
+    }
     for ray in rays:
         sums[:] = 0.0
         trace_rays(
@@ -170,7 +172,7 @@ def trace_rays(
         known[0] = 0.0
         for k in range(m):
             v = power[i, k]
-            observed[k + 1] = observed[k] + (v if v >= 0 else 0.0)
+            observed[k + 1] = observed[k] + (np.sqrt(v) if v >= 0 else 0.0)
             known[k + 1] = known[k] + (1.0 if v >= 0 else 0.0)
         top = phi[0]
         for j in range(last - 1):
@@ -208,7 +210,7 @@ def trace_rays(
                 if b > a:
                     predicted[k + 1] += density * (b - a)
         for k in range(m):
-            predicted[k + 1] += predicted[k]
+            predicted[k + 1] = predicted[k] + np.sqrt(predicted[k + 1] / ds)
         for j in range(last - 1):
             if begin[j] < 0:
                 continue
@@ -247,9 +249,10 @@ def trace_rays(
             t = (d + g * p) / lever
             if t < floor:
                 t = floor
-            share = min(energy[j] / pre, 1.0)
+            width = kb - ka
+            share = min(energy[j] / (rb - ra) / (pre / width) ** 2, 1.0)
             slope_h = exponent / t - (exponent - 1) * t / (1 + t * t)
-            ratio = np.log(max(obs, 1e-6 * floor * pre) / pre)
+            ratio = 2 * np.log(max(obs, 1e-3 * floor * pre) / pre)
             weight = num * f
             c = int(np.floor((east[i] + ux * g - west) / cell))
             r = int(np.floor((north[i] + uy * g - south) / cell))
