@@ -59,10 +59,10 @@ _ASPECT_SIGMA = 0.5
 _SHAPE_MEAN, _SHAPE_SIGMA = float(np.log(1.7)), 0.6
 _SHAPE_BOUNDS = (float(np.log(0.8)), float(np.log(8.0)))
 # The floor's angular law is near Lambert's square, but recorders and sediments differ.
-_LAW_MEAN, _LAW_SIGMA = float(np.log(1.8)), 0.25
+_LAW_MEAN, _LAW_SIGMA = float(np.log(1.9)), 0.18
 _FACETS_PER_BIN = 1.5
-# Starts of each kind that are climbed from, rounds of it, and rounds from the best of each kind.
-_TRIED_STARTS, _FIRST_ROUNDS, _LAST_ROUNDS = 3, 5, 20
+# Rounds of climbing from every start, and from the best two of each kind afterwards.
+_FIRST_ROUNDS, _LAST_ROUNDS = 6, 16
 
 
 def fit_patch(
@@ -79,14 +79,22 @@ def fit_patch(
     ]
     first = []
     for sign in (1.0, -1.0):
-        own = sorted((s for s in scored if s[1] == sign), key=lambda s: -s[0])
-        first += [_climb(patch, *s[1:], flat_value, _FIRST_ROUNDS) for s in own[:_TRIED_STARTS]]
+        # One start of each length across the track: the best of all alone would often be the longest ones,
+        # which fit loosely at once and cannot be mended by climbing.
+        best_of: dict[float, tuple[float, float, float, FloatArray]] = {}
+        for start in scored:
+            length = float(start[3][3])
+            if start[1] == sign and (length not in best_of or start[0] > best_of[length][0]):
+                best_of[length] = start
+        first += [
+            _climb(patch, *start[1:], flat_value, _FIRST_ROUNDS) for start in best_of.values()
+        ]
     last = []
     best = max((f.gain for f in first if f is not None), default=0.0)
     for sign in (1.0, -1.0):
         mine = sorted((f for f in first if f is not None and f.sign == sign), key=lambda f: -f.gain)
         # A kind that is far behind after the first rounds will not catch up.
-        for fit in mine[:1]:
+        for fit in mine[:2]:
             if fit.gain > 0.6 * best:
                 last.append(
                     _climb(patch, sign, fit.corner, fit.parameters, flat_value, _LAST_ROUNDS)
