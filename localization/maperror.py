@@ -119,25 +119,38 @@ def filter_map(
 
 
 def _between_cells(elevation_m: FloatArray, white_m: float) -> float:
-    """Estimate what bilinear interpolation misses, from what it misses on cells twice as wide.
+    """Estimate what bilinear interpolation misses, from what it misses on wider cells.
 
     The mean of a cell's four diagonal neighbours is the interpolation on a doubled grid at its worst
-    point. Going back to the grid itself divides the variance by 2^2H; H = 1/2 is taken, the roughest
-    that charts show, and half of the worst point's variance is the mean over a cell.
+    point; on a grid of four times the cell it misses more by a factor 2^p, p the ground's own power,
+    and going down to the grid itself divides by the same. Half of the worst point's variance is the
+    mean over a cell.
     """
-    inner = elevation_m[1:-1, 1:-1]
-    if inner.size == 0:
+    doubled, fourfold = (_missed(elevation_m, lag, white_m) for lag in (1, 2))
+    if doubled <= 0:
         return 0.0
+    # Between a jumble of steps and a smooth surface.
+    ratio = float(np.clip(fourfold / doubled, 2.0, 16.0))
+    return float(np.sqrt(doubled / ratio / 2))
+
+
+def _missed(elevation_m: FloatArray, lag: int, white_m: float) -> float:
+    """Mean square of a cell less the mean of its four diagonal neighbours, noise taken off."""
+    rows, cols = elevation_m.shape
+    if min(rows, cols) <= 2 * lag:
+        return 0.0
+    inner = elevation_m[lag:-lag, lag:-lag]
+    near, far = slice(None, -2 * lag), slice(2 * lag, None)
     corners = (
-        elevation_m[:-2, :-2] + elevation_m[:-2, 2:] + elevation_m[2:, :-2] + elevation_m[2:, 2:]
-    )
+        elevation_m[near, near] + elevation_m[near, far] + elevation_m[far, near]
+        + elevation_m[far, far]
+    )  # fmt: skip
     miss = (inner - corners / 4).ravel()
     miss = miss[np.isfinite(miss)]
     if miss.size < 16:
         return 0.0
     # The white error adds its own variance and a quarter of it to the difference.
-    excess = float(np.mean(miss**2)) - 1.25 * white_m**2
-    return float(np.sqrt(max(excess, 0.0) / 4))
+    return max(float(np.mean(miss**2)) - 1.25 * white_m**2, 0.0)
 
 
 def _spectrum(

@@ -37,7 +37,7 @@ _DOUBT = 0.05
 # Evidence is not hoarded above this, so that later failure shows soon; below minus `_REFUTED` the
 # map does worse than no map. Where ground or map tell little, the evidence is a random walk about
 # zero: an allowance for each update keeps that walk from reaching the bar.
-_MOST_EVIDENCE, _LEAST_EVIDENCE, _REFUTED, _ALLOWANCE = 20.0, -6.0, 15.0, 0.1
+_MOST_EVIDENCE, _LEAST_EVIDENCE, _REFUTED, _ALLOWANCE = 30.0, -6.0, 15.0, 0.1
 # Seconds without a sounding after which the status is dead reckoning.
 _SILENT_S = 15.0
 # A step longer than this, and faster than both speeds below, is a reset of dead reckoning.
@@ -316,7 +316,7 @@ class Navigator:
         tried = self.attempts
         return self.proved >= self.config.probation * 2 ** min(
             tried, 4
-        ) and self.evidence > self.config.proof + 3.0 * min(tried, 3)
+        ) and self.evidence > self.config.proof + 4.0 * min(tried, 5)
 
     def _trust(self) -> str:
         """Keep the state as one to return to; older ones are surer not to be spoilt already."""
@@ -376,8 +376,8 @@ class Navigator:
         if self.tracking:
             mean, covariance = self.bank.moments()
             proved = self._is_proved()
-            doubt = _DOUBT / (_DOUBT + (1 - _DOUBT) * math.exp(max(self.evidence, -30.0)))
             if not self.converged_once:
+                doubt = _doubt(self.evidence)
                 mean, covariance = with_doubt(mean, covariance, *self.reckoned, doubt)
             if silent:
                 return mean, covariance, RECKONING
@@ -385,7 +385,8 @@ class Navigator:
             return mean, covariance, CONVERGED if sure else SEARCHING
         mean, covariance = self.search.moments()
         if not self.converged_once:
-            mean, covariance = with_doubt(mean, covariance, *self.reckoned, _DOUBT)
+            doubt = _doubt(-self._surprise(mean, covariance))
+            mean, covariance = with_doubt(mean, covariance, *self.reckoned, doubt)
         return mean, covariance, RECKONING if silent else SEARCHING
 
     def _position(self, m: Measurement) -> tuple[float, float, float]:
@@ -397,6 +398,11 @@ class Navigator:
         gap = max(m.time_s - self.last.time_s, 0.0)
         ahead = self.velocity * gap
         return self.last.easting_m + ahead[0], self.last.northing_m + ahead[1], _BLIND_M_S * gap
+
+
+def _doubt(evidence: float) -> float:
+    """Probability that a place is the wrong one, given the evidence for it."""
+    return _DOUBT / (_DOUBT + (1 - _DOUBT) * math.exp(max(evidence, -30.0)))
 
 
 def _largest2(covariance: FloatArray) -> float:
