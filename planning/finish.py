@@ -8,7 +8,7 @@ segment is positive.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,8 @@ DEPTH_DIGITS = 4
 # of a double cannot turn a touch into a breach.
 _PROOF_M = 1e-6
 _LIFTS = 80
+# A vehicle holds its depth to about this (m): a start this much deeper is where it is.
+_START_M = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +75,19 @@ def proof_surfaces(surface: Surface) -> tuple[FloatArray, FloatArray]:
     )
 
 
-def finish(surface: Surface, points: FloatArray, spacing: float | None = None) -> Waypoints:
+def finish(
+    surface: Surface,
+    points: FloatArray,
+    spacing: float | None = None,
+    start_height_m: float | None = None,
+) -> Waypoints:
     """Print a control polygon as waypoints and prove their clearance.
 
     Parameters
     ----------
     points : (n, 2) control polygon, local coordinates.
     spacing : between waypoints; chosen by `waypoint_spacing` without.
+    start_height_m : where the vehicle is now; the profile begins there.
     """
     length = float(np.hypot(*np.diff(points, axis=0).T).sum())
     step = waypoint_spacing(surface, length) if spacing is None else spacing
@@ -87,10 +95,15 @@ def finish(surface: Surface, points: FloatArray, spacing: float | None = None) -
     easting, northing = surface.world(xy[:, 0], xy[:, 1])
     easting = np.round(easting, POSITION_DIGITS)
     northing = np.round(northing, POSITION_DIGITS)
-    return prove(surface, easting, northing)
+    return prove(surface, easting, northing, start_height_m)
 
 
-def prove(surface: Surface, easting_m: FloatArray, northing_m: FloatArray) -> Waypoints:
+def prove(
+    surface: Surface,
+    easting_m: FloatArray,
+    northing_m: FloatArray,
+    start_height_m: float | None = None,
+) -> Waypoints:
     """Give printed positions their best profile, lift it clear, and prove it."""
     x, y = surface.local(easting_m, northing_m)
     row, col = y / surface.cell_m[1], x / surface.cell_m[0]
@@ -103,6 +116,8 @@ def prove(surface: Surface, easting_m: FloatArray, northing_m: FloatArray) -> Wa
         return _problem(surface, easting_m, northing_m, bad, "barred ground or no data")
     upper = np.minimum(floor_at + surface.limits.ceiling_m, surface.top_m)
     lower = lower + _PROOF_M
+    if start_height_m is not None:
+        lower[0] = max(lower[0], start_height_m)
     weight = bilinear(surface.stack[..., WEIGHT], row, col)
     bend = surface.terms.altitude_per_m / float(weight.mean())
     z: FloatArray = lower.copy()
@@ -120,7 +135,11 @@ def prove(surface: Surface, easting_m: FloatArray, northing_m: FloatArray) -> Wa
         # Lifting both ends of a segment lifts all of it.
         lower[:-1] = np.maximum(lower[:-1], np.where(lift > 0, z[:-1] + lift, -np.inf))
         lower[1:] = np.maximum(lower[1:], np.where(lift > 0, z[1:] + lift, -np.inf))
-    return _verdict(surface, easting_m, northing_m, row, col, s, z, least_height, bottom)
+    proved = _verdict(surface, easting_m, northing_m, row, col, s, z, least_height, bottom)
+    if start_height_m is not None and z[0] > start_height_m + _START_M and not proved.problem:
+        late = f"the vehicle is {z[0] - start_height_m:.2f} m too deep to clear what lies ahead"
+        return replace(proved, problem=late)
+    return proved
 
 
 def _profile(

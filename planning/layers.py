@@ -20,7 +20,7 @@ from planning.field import neighbourhood, search
 from planning.surface import BOTTOM, LOWER, WEIGHT, Surface
 
 # Nodes of the thinned map, about; the search's time goes with it.
-_NODES = 62_500
+_NODES = 90_000
 # Height of a level as a share of the climb over one thinned cell at the steeper pitch limit: coarse
 # levels waste climb in rounding, fine ones waste time.
 _LEVEL_SHARE = 0.33

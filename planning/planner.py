@@ -251,7 +251,7 @@ def _second_tries(
     """
     best = min(candidates, key=_merit).points
     guides = [best]
-    for nodes, soft in ((250_000, False), (62_500, True)):
+    for nodes, soft in ((200_000, False), (60_000, True)):
         layered = layered_path(surface, tuple(ends[0]), tuple(ends[1]), soft=soft, nodes=nodes)
         if len(layered.points) > 2:
             length = float(np.hypot(*np.diff(layered.points, axis=0).T).sum())
@@ -281,6 +281,12 @@ def _best_proved(
         if not w.problem:
             return route_of(w, exact_cost(surface, w), crs), ""
         problem = problem or w.problem
+        if candidate.breach == 0:
+            # The plan kept its limits at its samples; a little more in reserve keeps them between.
+            careful = polish(surface, candidate.points, sweeps=20, rounds=1, reserve_m=_CAUTION_M)
+            w = finish(surface, careful.points)
+            if not w.problem:
+                return route_of(w, exact_cost(surface, w), crs), ""
     return None, problem
 
 

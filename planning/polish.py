@@ -15,11 +15,14 @@ from numba import njit
 
 from perception.records import FloatArray
 from planning.curve import sample_curve
-from planning.profile import make_work, path_cost
+from planning.profile import EXCESS_PRICE, make_work, path_cost
 from planning.surface import Surface
 
 # Price per metre by which the tangents of an arc do not fit: above what any shortcut can save.
 _OVERLAP_PRICE = 300.0
+# From round to round the price of breaking the ceiling rises by the inverse of this: at first a path may
+# cut through what a harder price would fence off, and settles into the better valley.
+_EASE = 0.25
 # Pitch and radius are planned a little inside the limits: printed digits must keep them too.
 PITCH_RESERVE = 0.995
 RADIUS_RESERVE = 1.01
@@ -59,6 +62,7 @@ def rules_of(surface: Surface, reserve_m: float = HEIGHT_RESERVE_M) -> FloatArra
             surface.bottom_most_m,
             surface.top_m,
             reserve_m,
+            EXCESS_PRICE,
         ]
     )
 
@@ -133,11 +137,13 @@ def polish(
     points, locked = _lock_ends(surface, points.copy())
     best = evaluate(surface, points.copy(), source, step, rules)
     for turn in range(rounds):
+        trial = rules.copy()
+        trial[8] = EXCESS_PRICE * _EASE ** (rounds - 1 - turn)
         if turn > 0:
             points, locked = _lock_ends(surface, respace(points, spacing))
         _descend(
             surface.stack, surface.cell_m[0], surface.cell_m[1], points, *locked,
-            surface.limits.turn_radius_m * RADIUS_RESERVE, step, rules,
+            surface.limits.turn_radius_m * RADIUS_RESERVE, step, trial,
             *_scratch(points, step), sweeps, _margin_m(surface),
         )  # fmt: skip
         found = evaluate(surface, points.copy(), source, step, rules)

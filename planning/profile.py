@@ -110,7 +110,8 @@ def path_cost(stack, width, height, px, py, n, rules, work, hull):  # type: igno
     Parameters
     ----------
     px, py : (>= n,) local coordinates of the samples.
-    rules : (8,) price a, slope up, slope down, floor, ceiling, least height, top, margin.
+    rules : (9,) price a, slope up, slope down, floor, ceiling, least height, top, margin, price of
+        excess over the ceiling.
     work : (>= n, 5) scratch; on return column 0 holds the distance, column 3 the heights.
     hull : (>= n,) integer scratch.
 
@@ -148,7 +149,7 @@ def path_cost(stack, width, height, px, py, n, rules, work, hull):  # type: igno
         cost += rate * math.sqrt(ds * ds + dz * dz)
         excess_total += max(0.0, z[i] - upper[i]) * ds
     return (
-        cost + EXCESS_PRICE * excess_total + BAR_PRICE * bar_total,
+        cost + rules[8] * excess_total + BAR_PRICE * bar_total,
         excess_total + bar_total,
     )
 
