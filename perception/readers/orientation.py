@@ -23,6 +23,7 @@ _PULSE_COARSE, _PULSE_FINE = 2, 5  # blocks at the very end that may hold the tr
 _SURE = 0.12  # of the ranks, by which one end must beat the other
 _AGREEING = 0.7  # of the pings, that must say the same
 _LEAST_SAMPLES = 32
+JUDGED_TOGETHER = 10  # successive pings; callers sample a file in runs of so many
 
 
 def near_end_evidence(rows: Iterable[FloatArray], hint_fraction: Iterable[float]) -> float:
@@ -30,7 +31,8 @@ def near_end_evidence(rows: Iterable[FloatArray], hint_fraction: Iterable[float]
 
     Parameters
     ----------
-    rows : echo amplitudes of some pings of one side, in stored order.
+    rows : echo amplitudes of some pings of one side, in stored order, in runs of
+        `JUDGED_TOGETHER` successive ones.
     hint_fraction : the altitude field over the ping's slant range; NaN unknown. It counts only
         where the rows alone do not decide, since altitude fields lie.
 
@@ -70,8 +72,7 @@ def first_return_fractions(rows: Iterable[FloatArray]) -> FloatArray:
         coarse = _coarse(np.array([_ranks(kept[i]) for i in known]))
         rises = _rises(coarse, _PULSE_COARSE, after=2)
         step = rises.max(axis=1)
-        # The first rise that is half of the greatest: speckle puts the greatest some blocks later.
-        at = (rises > 0.5 * step[:, None]).argmax(axis=1) + _PULSE_COARSE + 2.0
+        at = rises.argmax(axis=1) + _PULSE_COARSE + 2.0
         out[known] = np.where(step > 2 * _SURE, at / _COARSE, np.nan)
     return out
 
@@ -125,20 +126,36 @@ def _coarse(ranks: FloatArray) -> FloatArray:
 
 
 def _best_step(ranks: FloatArray) -> FloatArray:
-    """Return the greatest step (n,) over the whole row, or over its first quarter seen finely."""
-    whole = _rises(_coarse(ranks), _PULSE_COARSE).max(axis=1)
-    close = _rises(ranks[:, : _FINE // 4], _PULSE_FINE).max(axis=1)
-    return np.asarray(np.maximum(whole, close))
+    """Return the greatest step over the whole row, or over its first quarter seen finely.
+
+    One value for each group of successive pings: a first return stays in its place from ping to ping,
+    the ends of shadows of small things do not, so the rises are averaged before the greatest is taken.
+    """
+    starts = np.arange(0, len(ranks), _group(len(ranks)))
+    sizes = np.diff(np.append(starts, len(ranks)))[:, None]
+    whole = np.add.reduceat(_rises(_coarse(ranks), _PULSE_COARSE), starts) / sizes
+    close = np.add.reduceat(_rises(ranks[:, : _FINE // 4], _PULSE_FINE), starts) / sizes
+    return np.asarray(np.maximum(whole.max(axis=1), close.max(axis=1)))
+
+
+def _group(n: int) -> int:
+    """Return the pings a group has: ten, fewer where that would leave under six groups."""
+    return max(min(JUDGED_TOGETHER, n // 6), 1)
 
 
 def _rises(ranks: FloatArray, skip: int, after: int = _AFTER) -> FloatArray:
-    """Return the rise (n, candidates) from the upper quartile of all before to the mean just after."""
+    """Return the rise (n, candidates) from all before, and from just before, to just after.
+
+    The quiet before is the greater of the upper quartile of all and the mean of the blocks right
+    before: a level that swells gradually, as seen from the far end, is no step.
+    """
     deepest = int(_DEEPEST * ranks.shape[1])
     rises = np.empty((len(ranks), deepest - skip - 2))
     for column, at in enumerate(range(skip + 2, deepest)):
         rank = (at - skip) * 3 // 4
         before = np.partition(ranks[:, skip:at], rank, axis=1)[:, rank]
-        rises[:, column] = ranks[:, at : at + after].mean(axis=1) - before
+        near = ranks[:, max(at - after, skip) : at].mean(axis=1)
+        rises[:, column] = ranks[:, at : at + after].mean(axis=1) - np.maximum(before, near)
     return rises
 
 

@@ -123,9 +123,12 @@ def blank_samples(n: int, width: int) -> tuple[FloatArray, FloatArray]:
     return np.full((n, width), np.nan, np.float32), np.full((n, width), np.nan, np.float32)
 
 
-def spread_rows(n: int, most: int) -> IntArray:
-    """Return at most `most` rows, evenly over `n`: enough to judge a whole file by."""
-    return np.unique(np.linspace(0, max(n - 1, 0), min(n, most)).astype(np.int64))
+def spread_rows(n: int, most: int, together: int = 1) -> IntArray:
+    """Return at most `most` rows in runs of `together`, evenly over `n`: to judge a file by."""
+    if n <= most:
+        return np.arange(n)
+    starts = np.linspace(0, n - together, max(most // together, 1)).astype(np.int64)
+    return np.unique(starts[:, None] + np.arange(together))
 
 
 def floats(values: npt.ArrayLike) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pyxtf.enumerations import XTFChannelType
 
-from perception.readers.orientation import near_end_evidence
+from perception.readers.orientation import JUDGED_TOGETHER, near_end_evidence
 from perception.readers.raw import (
     RawFile,
     RawPings,
@@ -425,7 +425,7 @@ def _side(
     count = np.where(there, record["NumSamples"], 0).astype(np.int64)
     offset = np.where(there, index.channel_data[np.where(there, rows, 0)], -1)
     size = index.sample_bytes.get(number, 2)
-    judged = np.flatnonzero(there)[spread_rows(int(there.sum()), _JUDGED)]
+    judged = np.flatnonzero(there)[spread_rows(int(there.sum()), _JUDGED, JUDGED_TOGETHER)]
     raw = []
     with path.open("rb") as stream:
         for row in judged:

@@ -19,13 +19,14 @@ def pings(kind: str, share: float, n: int = 60) -> list[np.ndarray]:
 
 
 def ping(kind: str, altitude_m: float, rng: np.random.Generator) -> np.ndarray:
-    floor = np.sqrt(np.minimum(altitude_m / RANGES_M, 1.0)) * (RANGES_M > altitude_m)
+    r = RANGES_M
+    floor = np.sqrt(np.minimum(altitude_m / r, 1.0)) * (r > altitude_m)
     if kind in ("untuned", "noiseless"):
-        floor = floor / RANGES_M**2 * 10 ** (-0.05 * RANGES_M / 20)
+        floor = floor / r**2 * 10 ** (-0.05 * r / 20)
     level = floor * np.sqrt(rng.exponential(1.0, SAMPLES))
     at, length = rng.uniform(altitude_m * 1.3, RANGE_M), rng.uniform(1, 8)
-    level[(RANGES_M > at) & (RANGES_M < at + length)] *= 0.02
-    level[(RANGES_M > at - 1) & (RANGES_M < at)] *= 4
+    level[(r > at) & (r < at + length)] *= 0.02
+    level[(r > at - 1) & (r < at)] *= 4
     noise = {"untuned": 1e-3, "noiseless": 0.0}.get(kind, 0.01) * level.max()
     noise = noise * np.sqrt(rng.exponential(1.0, SAMPLES))
     if kind == "loud far noise":
