@@ -204,6 +204,16 @@ class SonarSection(Section):
             **given,
         }
 
+    @model_validator(mode="after")
+    def _hears_before_it_pings(self) -> SonarSection:
+        least_s = 2.0 * self.range_m / self.sound_speed_m_s
+        if self.ping_period_s < least_s:
+            raise ValueError(
+                f"ping_period_s = {self.ping_period_s:g} is shorter than the echo from "
+                f"range_m = {self.range_m:g} takes ({least_s:.3f} s)"
+            )
+        return self
+
 
 class Block(Section):
     """Parallel lines flown to and fro."""

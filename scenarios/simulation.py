@@ -78,6 +78,7 @@ def simulate(scenario: Scenario, progress: Progress = silent) -> Simulation:
     FileFrame(scenario.world.crs)
     start_time_s(scenario)
     refuse_outside(survey_lines(scenario.mission), scenario.world)
+    refuse_outside(legs_to_lines(scenario.locate.legs), scenario.world)
     rasters = _rasters(scenario)
     root = np.random.default_rng(scenario.seed)
     world_rng, prior_rng, survey_rng, fix_rng, return_rng, beam_rng = root.spawn(6)

@@ -46,7 +46,7 @@ def refuse_outside(lines: Sequence[Line], world: WorldSection) -> None:
     InputError
         Names the size that the lines need.
     """
-    ends = np.abs(np.reshape(lines, (-1, 2))).max(axis=0)
+    ends = np.abs(np.reshape(lines, (-1, 2))).max(axis=0, initial=0.0)
     for axis, reach, size in zip(
         ("east", "north"), ends, (world.size_east_m, world.size_north_m), strict=True
     ):

@@ -40,6 +40,7 @@ def complaint(tree):
         ({"vehicle": {"speed_m_s": float("nan")}}, ["vehicle.speed_m_s", "nan", "finite"]),
         ({"plan": {"start": [1.0, 2.0, 3.0]}}, ["plan.start"]),
         ({"world": 5}, ["world", "5"]),
+        ({"sonar": {"ping_period_s": 0.01}}, ["sonar", "ping_period_s = 0.01", "0.067 s"]),
     ],
 )
 def test_a_wrong_key_or_value_is_refused_in_one_line_that_names_it(tree, words):

@@ -138,7 +138,7 @@ def test_terrain_above_the_surface_and_crowded_objects_are_refused():
     with pytest.raises(InputError, match=r"rises .* above the surface"):
         world({"kind": "ridge", "height_m": 70.0})
     with pytest.raises(InputError, match="objects fit into"):
-        world({"kind": "boulders", "count": 500, "spacing_m": 20.0})
+        world({"kind": "boulders", "count": 60, "spacing_m": 60.0})
 
 
 def test_another_component_leaves_the_first_ones_draws_alone():
