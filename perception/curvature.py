@@ -232,26 +232,30 @@ def _curvature(
     for i in prange(rows):
         d = np.empty(5)
         v = np.empty(6)
+        line = np.empty((maps.shape[2], 6))
+        _row_of_maps(maps, i / step, line)
         for j in range(cols):
             if np.isnan(p[i, j]):
                 out[:, i, j] = np.nan
                 continue
             d[0], d[1], d[2], d[3], d[4] = p[i, j], q[i, j], r[i, j], s[i, j], t[i, j]
-            _bilinear_maps(maps, i / step, j / step, v)
+            left = min(j // step, maps.shape[2] - 1)
+            right = min(left + 1, maps.shape[2] - 1)
+            b = (j - left * step) / step
+            for k in range(6):
+                v[k] = line[left, k] + b * (line[right, k] - line[left, k])
             out[0, i, j], out[1, i, j], out[2, i, j], out[3, i, j] = _forms(d, v)
 
 
 @njit(cache=True)
-def _bilinear_maps(maps: npt.NDArray[Any], row: float, col: float, out: npt.NDArray[Any]) -> None:
-    """Sample every map at a fractional (row, col), held constant beyond the outermost nodes."""
+def _row_of_maps(maps: npt.NDArray[Any], row: float, out: npt.NDArray[Any]) -> None:
+    """Interpolate every map at a fractional row, held constant beyond the last, (nodes, maps)."""
     i = min(int(row), maps.shape[1] - 1)
-    j = min(int(col), maps.shape[2] - 1)
-    k, m = min(i + 1, maps.shape[1] - 1), min(j + 1, maps.shape[2] - 1)
-    a, b = min(row - i, 1.0), min(col - j, 1.0)
+    k = min(i + 1, maps.shape[1] - 1)
+    a = min(row - i, 1.0)
     for n in range(maps.shape[0]):
-        top = maps[n, i, j] * (1 - b) + maps[n, i, m] * b
-        low = maps[n, k, j] * (1 - b) + maps[n, k, m] * b
-        out[n] = top * (1 - a) + low * a
+        for j in range(maps.shape[2]):
+            out[j, n] = maps[n, i, j] * (1 - a) + maps[n, k, j] * a
 
 
 @njit(cache=True)
@@ -270,7 +274,7 @@ def _forms(d: npt.NDArray[Any], v: npt.NDArray[Any]) -> tuple[float, float, floa
     var_h += hp * hp * v[0] + hq * hq * v[1]
     var_k = t * t * v[2] + r * r * v[4] + 4 * s * s * v[3] + 2 * r * t * v[5]
     var_k += v[2] * v[4] + v[5] * v[5] + 2 * v[3] * v[3]
-    var_k /= w2**4
+    var_k /= w2 * w2 * w2 * w2
     kp, kq = 4 * p * gauss / w2, 4 * q * gauss / w2
     var_k += kp * kp * v[0] + kq * kq * v[1]
     return mean, gauss, np.sqrt(max(var_h, 0.0)), np.sqrt(max(var_k, 0.0))

@@ -61,8 +61,8 @@ def _block_scatter(z: FloatArray) -> FloatArray:
     blocks = (-(-rows // _BLOCK), -(-cols // _BLOCK))
     if rows < 5 and cols < 5:
         return np.full(blocks, np.nan)
-    # Four million differences tell as much as sixteen.
-    stride = max(1, int(np.sqrt(values.size / 4e6)))
+    # A million differences tell as much as sixteen.
+    stride = max(1, int(np.sqrt(values.size / 1e6)))
     scatter, count = np.empty(blocks), np.empty(blocks)
     _scatter(values, down, across, stride, scatter, count)
     scatter[count < min(_LEAST, 0.25 * values.size)] = np.nan
@@ -117,12 +117,12 @@ def _to_nodes(blocks: FloatArray, nodes: tuple[int, int], step: int) -> FloatArr
     return ndimage.map_coordinates(blocks, grid, order=1, mode="nearest")
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def _node_mean_square(values: Array, step: int, nodes: tuple[int, int]) -> Array:
     """Return the mean square of the positive values about each node; NaN where there is none."""
     out = np.empty(nodes)
     half = step // 2
-    for i in prange(nodes[0]):
+    for i in range(nodes[0]):
         for j in range(nodes[1]):
             total, n = 0.0, 0
             for a in range(max(i * step - half, 0), min(i * step + half, values.shape[0])):

@@ -42,7 +42,8 @@ def _sign_probabilities(
     value: float, sigma: float, tolerance: float, out: npt.NDArray[np.float64]
 ) -> None:
     """Write P(below -tolerance), P(within), P(above) of a Gaussian value."""
-    if sigma <= 0:
+    # Eight sigma clear of both tolerances nothing is left to share out (and erf is dear).
+    if sigma <= 0 or abs(value) - tolerance > 8 * sigma:
         out[0] = 1.0 if value < -tolerance else 0.0
         out[2] = 1.0 if value > tolerance else 0.0
     else:

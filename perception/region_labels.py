@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
 IntMap = npt.NDArray[np.int32]
 
@@ -68,9 +68,9 @@ def label_classes(class_code: npt.NDArray[np.uint8]) -> tuple[IntMap, int]:
     return region, count
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True)
 def _renumber(region: IntMap, number: npt.NDArray[np.int32]) -> None:
-    for i in prange(region.shape[0]):
+    for i in range(region.shape[0]):
         for j in range(region.shape[1]):
             region[i, j] = number[region[i, j]]
 
@@ -129,8 +129,8 @@ def region_borders(
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
     """Return neighbouring pairs (n, 2), smaller number first, and their common borders' lengths in m."""
     rows, cols = region.shape
-    keys = np.full(1 << 12, -1, np.int64)
-    length = np.zeros(1 << 12)
+    keys = np.full(1 << 16, -1, np.int64)
+    length = np.zeros(1 << 16)
     used = 0
     for i in range(rows):
         for j in range(cols):

@@ -12,8 +12,8 @@ noise the map itself is taken, and the rougher the ground the finer the scale.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +51,8 @@ _EXCESS = 0.3
 _RIM = np.array([0, 0.125, 0.25, 0.375, 0.55, 0.65, 0.75, 0.9, 1.12, 1.38, 1.62, 2.0])
 _RIM_HESSIAN = np.array([4.2, 3.68, 3.1, 2.77, 2.33, 2.05, 1.9, 1.5, 1.25, 1.11, 1.04, 1.0])
 _RIM_LAPLACIAN = np.array([3.6, 3.17, 2.66, 2.44, 2.08, 1.85, 1.75, 1.44, 1.24, 1.12, 1.04, 1.0])
+# A scale whose squared bias is this many times the least risk has a share of one in ten thousand.
+_HOPELESS = 10.0
 # Cells from one node to the next of the maps of weights, noise and scale.
 _STEP = 8
 # Above this many cells single precision is worked in, to stay within memory.
@@ -109,12 +111,12 @@ def smooth(
     flat, slope = _less_plane(z, cell_m, cell_north_m)
     noise = independent_noise(flat, sigma_m, _STEP)
     quadrature = _Quadrature(cell_m, cell_north_m, operator)
-    widest = _equivalent_width(scale_m, quadrature) if scale_m is not None else None
-    stack = _stack(flat, quadrature, widest)
-    if scale_m is not None:
-        stack = [stack[0]] if scale_m == 0 else [stack[-1]]
     rim = _rim_distance(flat, noise.shape)
-    weights = _weights(stack, noise, rim, quadrature)
+    if scale_m is None:
+        stack, weights = _weigh(_stack(flat, quadrature), noise, rim, quadrature)
+    else:
+        stack = [_only_scale(flat, quadrature, _equivalent_width(scale_m, quadrature))]
+        weights = np.ones((1, *noise.shape))
     gain, scale = _gain(stack, weights, rim, quadrature)
     planes = _blend(stack, weights, flat, quadrature)
     planes[0] += slope[0]
@@ -214,35 +216,59 @@ def _equivalent_width(scale_m: float, quadrature: _Quadrature) -> float:
         quadrature.weight @ (response**2 * d["tt"])
     )
     sigma_m = float(quadrature.equivalent_sigma_m(np.array(rr_tt)))
-    return max(scale_m * trial / sigma_m, 0.7)
+    return 0.0 if scale_m == 0 else max(scale_m * trial / sigma_m, 0.7)
 
 
-def _stack(
-    flat: npt.NDArray[np.floating], quadrature: _Quadrature, widest: float | None
-) -> list[_Scale]:
-    """Smooth at every scale, finest first; up to `widest` (then that one is the last) or the map's size."""
-    stack = [_Scale(flat, 1, 0.0, np.ones(quadrature.fx.shape))]
+def _map_itself(flat: npt.NDArray[np.floating], quadrature: _Quadrature) -> _Scale:
+    return _Scale(flat, 1, 0.0, np.ones(quadrature.fx.shape))
+
+
+def _stack(flat: npt.NDArray[np.floating], quadrature: _Quadrature) -> Iterator[_Scale]:
+    """Yield the map smoothed at every scale, finest first, up to a quarter of the map's size."""
+    yield _map_itself(flat, quadrature)
     level, prior, thinning = flat, np.ones(quadrature.fx.shape), 1
     limit = max(flat.shape) / 4
-    while True:
-        if widest is None:
-            widths: tuple[float, ...] = _WIDTHS
-        else:
-            widths = (widest / thinning,) if widest / thinning < 4 or min(level.shape) < 24 else ()
-        for width in widths:
-            if widest is None and width * thinning > limit:
-                continue
-            fit = quadrature.fit_response(width, thinning)
-            response = prior * (1 - (1 - fit) ** 2)
-            surface = fit_twice(level, quadrature.kernel(width), 0 if thinning == 1 else 4)
-            stack.append(_Scale(surface, thinning, width * thinning, response))
-        if (widest is not None and widths) or 2 * thinning * _WIDTHS[0] > limit:
-            return stack
+    while min(level.shape) >= 2 and _WIDTHS[0] * thinning <= limit:
+        for width in _WIDTHS:
+            if width * thinning <= limit:
+                yield _fitted(level, prior, thinning, width, quadrature)
         if min(level.shape) < 12:
-            return stack
-        prior = prior * quadrature.fit_response(_THINNING, thinning)
-        level = fit_smooth(level, quadrature.kernel(_THINNING), 2, 4)
-        thinning *= 2
+            return
+        level, prior, thinning = _thinned(level, prior, thinning, quadrature)
+
+
+def _only_scale(flat: npt.NDArray[np.floating], quadrature: _Quadrature, width: float) -> _Scale:
+    """Return the map smoothed by fits of one width, in cells of the map."""
+    if width == 0:
+        return _map_itself(flat, quadrature)
+    level, prior, thinning = flat, np.ones(quadrature.fx.shape), 1
+    # Beyond the map's own size every fit is the same, one quadratic through everything.
+    width = min(width, float(max(flat.shape)))
+    while width / thinning >= 4 and min(level.shape) >= 12:
+        level, prior, thinning = _thinned(level, prior, thinning, quadrature)
+    return _fitted(level, prior, thinning, width / thinning, quadrature)
+
+
+def _fitted(
+    level: npt.NDArray[np.floating],
+    prior: npt.NDArray[np.float64],
+    thinning: int,
+    width: float,
+    quadrature: _Quadrature,
+) -> _Scale:
+    fit = quadrature.fit_response(width, thinning)
+    surface = fit_twice(level, quadrature.kernel(width), 0 if thinning == 1 else 4)
+    return _Scale(surface, thinning, width * thinning, prior * (1 - (1 - fit) ** 2))
+
+
+def _thinned(
+    level: npt.NDArray[np.floating],
+    prior: npt.NDArray[np.float64],
+    thinning: int,
+    quadrature: _Quadrature,
+) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.float64], int]:
+    response = prior * quadrature.fit_response(_THINNING, thinning)
+    return fit_smooth(level, quadrature.kernel(_THINNING), 2, 4), response, 2 * thinning
 
 
 def _rim_distance(flat: npt.NDArray[np.floating], nodes: tuple[int, int]) -> FloatArray:
@@ -275,28 +301,39 @@ def _rim_rise(scale: _Scale, rim: FloatArray, table: FloatArray) -> FloatArray:
     return np.interp(rim / scale.width, _RIM, table)
 
 
-def _weights(
-    stack: list[_Scale], noise_m: FloatArray, rim: FloatArray, quadrature: _Quadrature
-) -> npt.NDArray[np.float64]:
-    """Return the share of every scale on the nodes, (scales, m, n), adding up to 1."""
-    if len(stack) == 1:
-        return np.ones((1, *noise_m.shape))
+def _weigh(
+    scales: Iterator[_Scale], noise_m: FloatArray, rim: FloatArray, quadrature: _Quadrature
+) -> tuple[list[_Scale], npt.NDArray[np.float64]]:
+    """Return the scales that matter and the share of each on the nodes, (scales, m, n), sum 1.
+
+    No wider scale is made once its bias alone rules it out everywhere.
+    """
     variance = noise_m**2
+    finer = next(scales)
+    stack = [finer]
     bias = np.zeros(noise_m.shape)
-    risk = [quadrature.hessian(stack[0].response) * variance]
-    for finer, coarser in pairwise(stack):
+    risk = [quadrature.hessian(finer.response) * variance]
+    least = risk[0]
+    for coarser in scales:
         energy = _band_energy(finer, coarser, noise_m.shape, quadrature)
         band = quadrature.hessian(finer.response - coarser.response, coarser.thinning)
         excess = np.where(energy > (1 + _EXCESS) * band * variance, energy - band * variance, 0.0)
         bias = bias + excess
         rise = _rim_rise(coarser, rim, _RIM_HESSIAN) ** 2
         risk.append(bias + quadrature.hessian(coarser.response) * variance * rise)
+        stack.append(coarser)
+        least = np.minimum(least, risk[-1])
+        if (bias > _HOPELESS * least).all():
+            break
+        finer = coarser
     risks = np.array(risk)
-    least = risks.min(axis=0)
     # Where even the best is exact, all that are as exact share.
     ratio = np.where(risks > 0, least / np.where(risks > 0, risks, 1.0), 1.0)
     weights = ratio**4
-    return weights / weights.sum(axis=0)
+    weights /= weights.sum(axis=0)
+    used = weights.max(axis=(1, 2)) > 1e-3
+    weights = weights[used]
+    return [s for s, u in zip(stack, used, strict=True) if u], weights / weights.sum(axis=0)
 
 
 def _band_energy(
@@ -436,6 +473,23 @@ def _refine(
 
 
 @njit(cache=True)
+def _three_points(
+    z: npt.NDArray[np.floating], i: int, j: int, dx: float, dy: float, d: npt.NDArray[np.float64]
+) -> bool:
+    """Differentiate centrally; False where the window leaves the array or meets a NaN."""
+    rows, cols = z.shape
+    if i < 1 or j < 1 or i > rows - 2 or j > cols - 2:
+        return False
+    east, west, north, south, mid = z[i, j + 1], z[i, j - 1], z[i - 1, j], z[i + 1, j], z[i, j]
+    d[0] = (east - west) / (2 * dx)
+    d[1] = (north - south) / (2 * dy)
+    d[2] = ((east - mid) - (mid - west)) / (dx * dx)
+    d[3] = (z[i - 1, j + 1] + z[i + 1, j - 1] - z[i - 1, j - 1] - z[i + 1, j + 1]) / (4 * dx * dy)
+    d[4] = ((north - mid) - (mid - south)) / (dy * dy)
+    return not np.isnan(d[2] + d[3] + d[4])
+
+
+@njit(cache=True)
 def _five_points(
     z: npt.NDArray[np.floating], i: int, j: int, dx: float, dy: float, d: npt.NDArray[np.float64]
 ) -> bool:
@@ -489,9 +543,10 @@ def _mix(
                 if part == 0.0:
                     planes[:, i, j] = np.nan
                 continue
-            if not (wide and _five_points(z, i, j, dx, dy, d)):
-                stencil(z, i, j, box)
-                differentiate(box, dx, dy, fit and not wide, d)
+            if fit or wide or not _three_points(z, i, j, dx, dy, d):
+                if not (wide and _five_points(z, i, j, dx, dy, d)):
+                    stencil(z, i, j, box)
+                    differentiate(box, dx, dy, fit and not wide, d)
             for k in range(5):
                 if part == 0.0:
                     planes[k, i, j] = d[k]
