@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perception.records import FloatArray, bilinear
-from planning.clearance import polyline_extremes
 from planning.curve import waypoints
+from planning.ground import Ground, SurfaceGround
 from planning.polish import PITCH_RESERVE, RADIUS_RESERVE
 from planning.profile import bridge_troughs, cone_envelope
 from planning.surface import WEIGHT, Surface
@@ -67,14 +67,6 @@ def waypoint_spacing(surface: Surface, length_m: float) -> float:
     return max(spacing, length_m / 200_000.0)
 
 
-def proof_surfaces(surface: Surface) -> tuple[FloatArray, FloatArray]:
-    """Return least heights and bottom in double precision, NaN wherever a route may not pass."""
-    return (
-        np.where(surface.barred, np.nan, surface.lower_m),
-        np.where(surface.barred, np.nan, surface.bottom_m),
-    )
-
-
 def finish(
     surface: Surface,
     points: FloatArray,
@@ -103,39 +95,40 @@ def prove(
     easting_m: FloatArray,
     northing_m: FloatArray,
     start_height_m: float | None = None,
+    ground: Ground | None = None,
 ) -> Waypoints:
-    """Give printed positions their best profile, lift it clear, and prove it."""
-    x, y = surface.local(easting_m, northing_m)
-    row, col = y / surface.cell_m[1], x / surface.cell_m[0]
-    least_height, bottom = proof_surfaces(surface)
-    s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    lower = np.maximum(bilinear(least_height, row, col), surface.bottom_most_m)
-    floor_at = bilinear(bottom, row, col)
+    """Give printed positions their best profile, lift it clear, and prove it.
+
+    Parameters
+    ----------
+    ground : what the proof is over; the surface itself without.
+    """
+    ground = SurfaceGround(surface) if ground is None else ground
+    s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(easting_m), np.diff(northing_m)))])
+    least_height, bottom, weight = ground.at(easting_m, northing_m)
+    lower = np.maximum(least_height, surface.bottom_most_m)
     if not np.isfinite(lower).all():
         bad = int(np.flatnonzero(~np.isfinite(lower))[0])
-        return _problem(surface, easting_m, northing_m, bad, "barred ground or no data")
-    upper = np.minimum(floor_at + surface.limits.ceiling_m, surface.top_m)
+        return _problem(easting_m, northing_m, bad)
+    upper = np.minimum(bottom + surface.limits.ceiling_m, surface.top_m)
     lower = lower + _PROOF_M
     if start_height_m is not None:
         lower[0] = max(lower[0], start_height_m)
-    weight = bilinear(surface.stack[..., WEIGHT], row, col)
     bend = surface.terms.altitude_per_m / float(weight.mean())
     z: FloatArray = lower.copy()
     for _ in range(_LIFTS):
         z = _profile(surface, s, lower, upper, bend)
-        margin = polyline_extremes(least_height, row, col, z)
+        margin, _ = ground.extremes(easting_m, northing_m, z)
         if np.isnan(margin.least_m).any():
-            bad = int(np.flatnonzero(np.isnan(margin.least_m))[0])
-            return _problem(surface, easting_m, northing_m, bad, "barred ground or no data")
+            return _problem(easting_m, northing_m, int(np.flatnonzero(np.isnan(margin.least_m))[0]))
         short = _PROOF_M / 2 - margin.least_m
         if (short <= 0).all():
             break
-        lift = np.maximum(short, 0.0) + _PROOF_M
-        lift[short <= 0] = 0.0
+        lift = np.where(short > 0, short + _PROOF_M, -np.inf)
         # Lifting both ends of a segment lifts all of it.
-        lower[:-1] = np.maximum(lower[:-1], np.where(lift > 0, z[:-1] + lift, -np.inf))
-        lower[1:] = np.maximum(lower[1:], np.where(lift > 0, z[1:] + lift, -np.inf))
-    proved = _verdict(surface, easting_m, northing_m, row, col, s, z, least_height, bottom)
+        lower[:-1] = np.maximum(lower[:-1], z[:-1] + lift)
+        lower[1:] = np.maximum(lower[1:], z[1:] + lift)
+    proved = _verdict(surface, ground, easting_m, northing_m, s, z, bottom)
     if start_height_m is not None and z[0] > start_height_m + _START_M and not proved.problem:
         late = f"the vehicle is {z[0] - start_height_m:.2f} m too deep to clear what lies ahead"
         return replace(proved, problem=late)
@@ -159,18 +152,15 @@ def _profile(
 
 def _verdict(
     surface: Surface,
+    ground: Ground,
     easting_m: FloatArray,
     northing_m: FloatArray,
-    row: FloatArray,
-    col: FloatArray,
     s: FloatArray,
     z: FloatArray,
-    least_height: FloatArray,
     bottom: FloatArray,
 ) -> Waypoints:
     limits = surface.limits
-    margin = polyline_extremes(least_height, row, col, z)
-    altitude = polyline_extremes(bottom, row, col, z)
+    margin, altitude = ground.extremes(easting_m, northing_m, z)
     at, v = margin.worst()
     slope = np.diff(z) / np.maximum(np.diff(s), 1e-12)
     problem = ""
@@ -199,7 +189,7 @@ def _verdict(
     nxt = min(at + 1, len(z) - 1)
     worst = tuple(float(a[at] + v * (a[nxt] - a[at])) for a in (easting_m, northing_m, -z))
     return Waypoints(
-        easting_m, northing_m, -z + 0.0, z - bilinear(bottom, row, col),
+        easting_m, northing_m, -z + 0.0, z - bottom,
         headings(easting_m, northing_m),
         np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(s), np.diff(z)))]),
         least, float(np.min(altitude.least_m)), highest,
@@ -207,14 +197,12 @@ def _verdict(
     )  # fmt: skip
 
 
-def _problem(
-    surface: Surface, easting_m: FloatArray, northing_m: FloatArray, at: int, what: str
-) -> Waypoints:
+def _problem(easting_m: FloatArray, northing_m: FloatArray, at: int) -> Waypoints:
     nothing = np.full(len(easting_m), np.nan)
     worst = (float(easting_m[at]), float(northing_m[at]), math.nan)
     return Waypoints(
         easting_m, northing_m, nothing, nothing, nothing, nothing,
-        math.nan, math.nan, math.nan, worst, f"the path meets {what}",
+        math.nan, math.nan, math.nan, worst, "the path meets barred ground or no data",
     )  # fmt: skip
 
 
