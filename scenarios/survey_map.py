@@ -6,8 +6,9 @@ Each function is one stage; the arithmetic lives in `perception` and `mapping`.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -131,14 +132,53 @@ def map_survey(
     return SurveyMap(grid, track, navigated_track(survey), results, corrected, inversion)
 
 
-def build_passes(survey: Survey, progress: Progress = silent) -> tuple[PassSummary, ...]:
-    """Turn every pass into a strip, reading one pass at a time."""
+# The last survey's passes: a mission's strips and map are two commands in one process, and the same
+# echoes need not be cut twice.
+_recent: dict[tuple[object, ...], tuple[PassSummary, ...]] = {}
+
+
+def build_passes(
+    survey: Survey,
+    progress: Progress = silent,
+    tell: Callable[[int, Swath, PassResult], None] | None = None,
+) -> tuple[PassSummary, ...]:
+    """Turn every pass into a strip, reading one pass at a time.
+
+    Parameters
+    ----------
+    tell : called with the number, the swath and the whole result of each pass, before it is let go.
+    """
+    key = _identity(survey)
+    if tell is None and key in _recent:
+        return _recent[key]
     results = []
     for index in range(survey.n_passes):
         progress("echoes to strips", index, survey.n_passes)
-        results.append(PassSummary.of(build_strip(survey.swath(index))))
+        swath = survey.swath(index)
+        result = build_strip(swath)
+        if tell is not None:
+            tell(index, swath, result)
+        results.append(PassSummary.of(result))
     progress("echoes to strips", survey.n_passes, survey.n_passes)
-    return tuple(results)
+    _recent.clear()
+    _recent[key] = tuple(results)
+    return _recent[key]
+
+
+def _identity(survey: Survey) -> tuple[object, ...]:
+    """Return what makes two openings of a survey the same: its files as they are, its frame, its poses."""
+    files = tuple((str(f.path.resolve()), *_stamp(f.path)) for f in survey.files)
+    pings = survey.pings
+    poses = tuple(
+        hash(np.ascontiguousarray(getattr(pings, name)).tobytes())
+        for name in ("easting_m", "northing_m", "depth_m", "heading_rad", "sample_m", "pass_index")
+    )
+    return (*files, survey.crs, *poses)
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
 
 
 def navigated_track(survey: Survey) -> Trajectory:
@@ -224,7 +264,7 @@ def _look(
     port, starboard = result.masks()
     return Look(
         swath=corrected_swath(swath, track, float(corrected.height_m[index])),
-        altitude_m=result.bottom.altitude_m,
+        altitude_m=np.where(result.bottom.valid, result.bottom.first_return_m, np.nan),
         altitude_sigma_m=result.bottom.sigma_m,
         shadow_port=port,
         shadow_starboard=starboard,
