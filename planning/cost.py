@@ -7,7 +7,7 @@ length of path. `w` (no unit) says how good the ground is, `a` (per metre) how d
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,24 @@ class CostTerms:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"cost term {name} must be 0 or more, got {value}")
+
+
+def read_terms(path: Path | None) -> CostTerms:
+    """Read the table `[cost]` of a TOML file; None gives the defaults."""
+    if path is None:
+        return CostTerms()
+    table = read_toml(path).get("cost")
+    known = {f.name for f in fields(CostTerms)}
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: has no table [cost]; it may hold {', '.join(sorted(known))}")
+    for key, value in table.items():
+        if key not in known:
+            raise InputError(
+                f"{path}: unknown key {key!r} in [cost]; there are {', '.join(sorted(known))}"
+            )
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(f"{path}: {key} must be a number, got {value!r}")
+    return CostTerms(**{key: float(value) for key, value in table.items()})
 
 
 def read_class_weights(path: Path) -> dict[str, float]:

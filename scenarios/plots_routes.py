@@ -1,0 +1,195 @@
+"""Pictures of routes: the map with the route and its worst point, and the profile of depths."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import LightSource
+
+from perception.files import whole_file
+from perception.records import FloatArray
+from planning.coverage import Survey
+from planning.failure import Blockage
+from planning.planner import Plan
+from planning.route import Route
+from planning.surface import Surface
+
+# Pixels along the longer side of the map; a larger map is thinned.
+_PIXELS = 900
+_DPI = 110
+
+
+def picture_plan(path: Path, plan: Plan) -> None:
+    """Draw a plan: its route with the worst point, or the place that blocks."""
+    if plan.route is not None:
+        _picture_route(path, plan, plan.route)
+    elif plan.blockage is not None:
+        _picture_blockage(path, plan.surface, plan.blockage)
+
+
+def _picture_route(path: Path, plan: Plan, route: Route) -> None:
+    surface = plan.surface
+    figure, (upper, lower) = _figure()
+    box = _box(surface, route.easting_m, route.northing_m)
+    _draw_map(upper, surface, box)
+    if len(plan.grid_path):
+        e, n = surface.world(plan.grid_path[:, 0], plan.grid_path[:, 1])
+        upper.plot(e, n, color="white", lw=0.8, ls=":", label="grid search at the floor, no limits")
+    upper.plot(route.easting_m, route.northing_m, color="crimson", lw=1.6, label="route")
+    upper.plot(*route.worst[:2], "o", mfc="none", mec="gold", ms=9, mew=2, label="least margin")
+    upper.plot(
+        route.easting_m[0], route.northing_m[0], "^", color="white", mec="black", label="start"
+    )
+    upper.plot(
+        route.easting_m[-1], route.northing_m[-1], "s", color="white", mec="black", label="goal"
+    )
+    upper.legend(loc="best", fontsize=7, framealpha=0.85)
+    upper.set_title(
+        f"cost {route.cost:.0f} = {route.cost / plan.grid_cost:.3f} of the grid search; "
+        f"length {route.length_m:.0f} m, mean altitude {route.mean_altitude_m:.2f} m",
+        fontsize=9,
+    )
+    s = np.concatenate(
+        [[0.0], np.cumsum(np.hypot(np.diff(route.easting_m), np.diff(route.northing_m)))]
+    )
+    z = -route.depth_m
+    bottom = z - route.altitude_m
+    limits = surface.limits
+    _draw_profile(lower, s, bottom, z, limits.floor_m, limits.ceiling_m)
+    at = int(
+        np.argmin(np.hypot(route.easting_m - route.worst[0], route.northing_m - route.worst[1]))
+    )
+    lower.plot(s[at], -route.worst[2], "o", mfc="none", mec="goldenrod", ms=9, mew=2)
+    lower.annotate(
+        f"least margin {route.min_clearance_margin_m:.3f} m over {limits.floor_m:g} m"
+        + (f" + {plan.k:.2f} sigma" if plan.k > 0 else ""),
+        (s[at], -route.worst[2]), xytext=(8, 14), textcoords="offset points", fontsize=7,
+    )  # fmt: skip
+    _save(path, figure)
+
+
+def _picture_blockage(path: Path, surface: Surface, blockage: Blockage) -> None:
+    figure, (upper, lower) = _figure()
+    e, n = blockage.path[:, 0], blockage.path[:, 1]
+    _draw_map(upper, surface, _box(surface, e, n))
+    upper.plot(e, n, color="orange", lw=1.3, label="the path that breaks least")
+    upper.plot(*blockage.place, "x", color="crimson", ms=11, mew=2.5, label="what blocks")
+    upper.legend(loc="best", fontsize=7)
+    upper.set_title("no route: " + _wrapped(blockage.reason, 95), fontsize=7.5)
+    s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(e), np.diff(n)))])
+    _draw_profile(
+        lower,
+        s,
+        blockage.bottom_m,
+        blockage.height_m,
+        surface.limits.floor_m,
+        surface.limits.ceiling_m,
+    )
+    at = int(np.argmin(np.hypot(e - blockage.place[0], n - blockage.place[1])))
+    lower.axvline(s[at], color="crimson", lw=1.0)
+    _save(path, figure)
+
+
+def picture_survey(path: Path, surface: Surface, survey: Survey, area: Any) -> None:
+    """Draw survey lines over the area asked for, and the depth profile of the whole."""
+    import shapely
+
+    figure, (upper, lower) = _figure()
+    w = survey.path
+    _draw_map(upper, surface, _box(surface, w.easting_m, w.northing_m))
+    upper.plot(*shapely.get_coordinates(area.exterior).T, color="gold", lw=1.5, label="area")
+    upper.plot(w.easting_m, w.northing_m, color="crimson", lw=0.8, label="track with turns")
+    for begin, end in survey.lines:
+        upper.plot([begin[0], end[0]], [begin[1], end[1]], color="white", lw=1.2)
+    upper.legend(loc="best", fontsize=7)
+    upper.set_title(
+        f"{len(survey.lines)} lines cover {100 * survey.covered:.1f} % of the area", fontsize=9
+    )
+    if np.isfinite(w.depth_m).all():
+        s = np.concatenate(
+            [[0.0], np.cumsum(np.hypot(np.diff(w.easting_m), np.diff(w.northing_m)))]
+        )
+        z = -w.depth_m
+        _draw_profile(
+            lower, s, z - w.altitude_m, z, surface.limits.floor_m, surface.limits.ceiling_m
+        )
+    _save(path, figure)
+
+
+def _figure() -> tuple[Any, Any]:
+    return plt.subplots(2, 1, figsize=(8.5, 9.5), height_ratios=(2.4, 1.0), constrained_layout=True)
+
+
+def _box(surface: Surface, easting_m: FloatArray, northing_m: FloatArray) -> tuple[int, ...]:
+    """Return rows and columns around a path, with a margin of a fifth of its extent."""
+    x, y = surface.local(easting_m, northing_m)
+    rows, cols = surface.shape
+    out = []
+    for values, cell, n in ((y, surface.cell_m[1], rows), (x, surface.cell_m[0], cols)):
+        extent = max(float(np.ptp(x)), float(np.ptp(y)))
+        margin = 0.15 * extent + 10 * cell
+        out += [
+            max(0, int((values.min() - margin) / cell)),
+            min(n, int((values.max() + margin) / cell) + 2),
+        ]
+    return tuple(out)
+
+
+def _draw_map(axes: Any, surface: Surface, box: tuple[int, ...]) -> None:
+    r0, r1, c0, c1 = box
+    thin = max(1, max(r1 - r0, c1 - c0) // _PIXELS)
+    z = surface.bottom_m[r0:r1:thin, c0:c1:thin]
+    width, height = surface.cell_m[0] * thin, surface.cell_m[1] * thin
+    filled = np.where(np.isfinite(z), z, np.nanmin(z) if np.isfinite(z).any() else 0.0)
+    low, high = np.percentile(filled, [1, 99])
+    shaded = LightSource(315, 45).shade(
+        filled, plt.get_cmap("viridis"), vmin=low, vmax=max(high, low + 1e-6), dx=width, dy=height,
+        blend_mode="soft", vert_exag=1.5,
+    )  # fmt: skip
+    shaded[surface.barred[r0:r1:thin, c0:c1:thin]] = (0.75, 0.75, 0.75, 1.0)
+    west, north = surface.world(
+        np.array((c0 - 0.5) * surface.cell_m[0]), np.array((r0 - 0.5) * surface.cell_m[1])
+    )
+    rows, cols = z.shape
+    axes.imshow(
+        shaded,
+        extent=(west, west + cols * width, north - rows * height, north),
+        interpolation="nearest",
+    )
+    axes.set_xlabel("easting (m)")
+    axes.set_ylabel("northing (m)")
+    axes.ticklabel_format(useOffset=False, style="plain")
+    axes.tick_params(labelsize=7)
+
+
+def _draw_profile(
+    axes: Any, s: FloatArray, bottom: FloatArray, z: FloatArray, floor_m: float, ceiling_m: float
+) -> None:
+    axes.fill_between(s, bottom, np.nanmin(bottom) - 3.0, color="0.55", label="bottom")
+    axes.plot(s, bottom + floor_m, color="black", lw=0.6, ls="--", label=f"floor {floor_m:g} m")
+    axes.plot(
+        s, bottom + ceiling_m, color="steelblue", lw=0.6, ls="--", label=f"ceiling {ceiling_m:g} m"
+    )
+    axes.plot(s, z, color="crimson", lw=1.3, label="vehicle")
+    axes.set_xlabel("distance (m)")
+    axes.set_ylabel("height (m)")
+    axes.set_xlim(s[0], max(s[-1], s[0] + 1e-6))
+    axes.legend(loc="best", fontsize=7, ncols=4)
+
+
+def _wrapped(text: str, width: int) -> str:
+    import textwrap
+
+    return "\n".join(textwrap.wrap(text, width))
+
+
+def _save(path: Path, figure: Any) -> None:
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=_DPI)
+    plt.close(figure)
