@@ -112,7 +112,9 @@ def _refuse_unusable_frame(source: Any, path: Path) -> None:
             f"{path}: its cells are in degrees ({source.crs.to_string()}); "
             "warp it to metres: gdalwarp -t_srs EPSG:<UTM zone> in.tif out.tif"
         )
-    if source.crs is not None and source.crs.linear_units_factor[1] != 1.0:
+    # A local (engineering) CRS is neither geographic nor projected: GDAL knows no unit of it.
+    projected = source.crs is not None and source.crs.is_projected
+    if projected and source.crs.linear_units_factor[1] != 1.0:
         raise InputError(
             f"{path}: its cells are in {source.crs.linear_units_factor[0]}; "
             "warp it to metres: gdalwarp -t_srs EPSG:<UTM zone> in.tif out.tif"

@@ -143,7 +143,9 @@ def with_tow(
     without a compass; its depth stays as recorded.
     """
     point = with_lever_arm(poses, navigation_m, point_m)
-    ends: IntArray = np.flatnonzero((np.diff(poses.time_s) < 0) | (np.diff(poses.time_s) > 600.0)) + 1
+    ends: IntArray = (
+        np.flatnonzero((np.diff(poses.time_s) < 0) | (np.diff(poses.time_s) > 600.0)) + 1
+    )
     east, north = poses.easting_m.copy(), poses.northing_m.copy()
     heading = poses.heading_rad.copy()
     for a, b in pairwise([0, *ends.tolist(), len(poses.time_s)]):

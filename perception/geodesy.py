@@ -8,10 +8,11 @@ from pyproj.exceptions import CRSError, ProjError
 
 from perception.records import FloatArray, InputError
 
-# Metric navigation without a zone has no place on Earth: an engineering CRS says so, and GDAL,
-# PROJ and QGIS all read this older spelling of one.
+# Metric navigation without a zone has no place on Earth: an engineering CRS says so. GDAL, PROJ and
+# QGIS read this older spelling of one, and GDAL gives it back letter by letter from a map file.
 LOCAL_CRS = (
-    'LOCAL_CS["local metric grid",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+    'LOCAL_CS["local metric grid",UNIT["metre",1,AUTHORITY["EPSG","9001"]],'
+    'AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
 GEOGRAPHIC = "EPSG:4326"
 

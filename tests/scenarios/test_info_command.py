@@ -175,3 +175,12 @@ def test_sensors_lists_every_sonar_with_its_source(bathynav):
     assert sheet.image_s == pytest.approx(steps * 2 * sheet.range_m / 1500.0, rel=0.01)
     with pytest.raises(KeyError, match="there are side-scan"):
         sonar_named("ear")
+
+
+def test_a_local_grid_survives_a_map_file(tmp_path):
+    from mapping.rasters import read_map, write_map
+    from perception.geodesy import LOCAL_CRS
+    from perception.records import Grid
+
+    write_map(tmp_path / "a.tif", Grid(np.ones((5, 5)), 0.0, 5.0, 1.0, crs=LOCAL_CRS))
+    assert read_map(tmp_path / "a.tif").crs == LOCAL_CRS
