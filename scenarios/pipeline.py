@@ -46,6 +46,8 @@ def mission_stages(scenario: Scenario, out: Path) -> list[Stage]:
         options += ["--cell", repr(scenario.map.cell_m)]
     if scenario.map.fixes and scenario.navigation.fixes != "none":
         options += ["--fixes", str(simulated / "surface-fixes.csv")]
+    if scenario.navigation.tide_amplitude_m > 0:
+        options += ["--tide", str(simulated / "tide.csv")]
     if scenario.map.prior:
         options += ["--prior", str(simulated / "prior.tif")]
     stages.append(Stage("map", ("map", *survey, *options)))

@@ -23,6 +23,7 @@ from scipy import stats
 
 from perception.files import read_toml
 from perception.records import FloatArray, InputError
+from scenarios.schema import rasters_from
 
 _BITS = 63  # of a child's seed: the widest that TOML's signed integers hold
 
@@ -159,7 +160,8 @@ def read_sweep(path: Path) -> SweepPlan:
     InputError
         No `[sweep]`, an unknown or wrong key in it, an axis without values, an empty grid.
     """
-    scenario = read_toml(path)
+    # Relative paths of rasters start at the sweep's file, wherever a run is computed.
+    scenario = rasters_from(read_toml(path), path.parent)
     table = scenario.pop("sweep", None)
     if not isinstance(table, dict):
         raise InputError(f"{path}: has no [sweep] table; `bathynav run` takes a single scenario")
