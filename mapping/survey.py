@@ -8,15 +8,20 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from mapping.fixes import PositionFix
+from mapping.fusion import default_cell as default_fusion_cell
+from mapping.fusion import fuse
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
 from mapping.overlaps import Window, find_overlaps
 from mapping.pose_graph import GraphConfig, Link, Solution, perpendicular, solve
-from mapping.registration import Match, MatchConfig, Texture, default_cell, match, texture
+from mapping.registration import Match, match
+from mapping.textures import MatchConfig, Texture, default_cell, texture
 from perception.records import (
     ElevationStrip,
     FloatArray,
+    Grid,
     InputError,
     Progress,
     Trajectory,
@@ -159,6 +164,27 @@ def correct_survey(
     return _result(strips, keyframes, solution, found, rounds, config)
 
 
+def known_floor(strips: Sequence[ElevationStrip]) -> Grid | None:
+    """Return the floor as the strips know it so far, smooth: soundings between the tracks count most.
+
+    It serves to place echoes (`textures.placed_across`); a strip's heights are far better under its own
+    track than at its rim, and `fuse` weights them so.
+    """
+    if not any(np.isfinite(s.elevation_m).any() for s in strips):
+        return None
+    altitude = float(np.nanmedian(np.concatenate([s.altitude_m for s in strips])))
+    cell_m = max(default_fusion_cell(strips), altitude / 6.0)
+    grid = fuse(strips, cell_m)
+    weight = np.where(
+        np.isfinite(grid.elevation_m), 1.0 / np.nan_to_num(np.asarray(grid.sigma_m), nan=1.0) ** 2, 0
+    )
+    width = 0.4 * altitude / cell_m
+    total = gaussian_filter(weight, width)
+    mean = gaussian_filter(weight * np.nan_to_num(grid.elevation_m), width)
+    height = np.where(total > 0, mean / np.where(total > 0, total, 1.0), np.nan)
+    return replace(grid, elevation_m=height)
+
+
 def _check(strips: Sequence[ElevationStrip]) -> None:
     if not strips:
         raise InputError("the survey holds no strip; was a pass of ten pings or more found?")
@@ -184,7 +210,7 @@ def _window_side(strips: Sequence[ElevationStrip], config: SurveyConfig, number:
     width = _swath_width(strips)
     if number == 0:
         return config.first_window_m or 0.8 * width
-    return config.window_m or 0.4 * width
+    return config.window_m or 0.6 * width
 
 
 def _round(
@@ -200,12 +226,13 @@ def _round(
 ) -> tuple[list[Registration], Solution]:
     """Compare the passes over every window and solve the graph with what came of it."""
     textures: dict[int, Texture] = {}
+    floor = known_floor(corrected)
     results: list[tuple[Window, Match]] = []
     links: list[Link] = []
     for done, window in enumerate(windows, start=1):
         for index in (window.first, window.second):
             if index not in textures:
-                textures[index] = texture(corrected[index], config.match)
+                textures[index] = texture(corrected[index], config.match, floor)
         ends = [
             keyframes.nearest(s, line)
             for s, line in ((window.first, window.first_line), (window.second, window.second_line))
@@ -224,7 +251,14 @@ def _round(
         )
         results.append((window, result))
         if result.accepted:
-            links.append(_link(keyframes, solution, window, result, ends, config.graph))
+            link = _link(keyframes, solution, window, result, ends, config.graph)
+            misplaced = [
+                _misplacement(corrected[int(keyframes.strip[k])], keyframes, k, link_offset)
+                for k, link_offset in zip(
+                    ends, (link.first_offset_m, link.second_offset_m), strict=True
+                )
+            ]
+            links.append(replace(link, covariance_m2=link.covariance_m2 + sum(misplaced)))
         progress(f"registering, round {number + 1}", done, len(windows))
     after = solve(keyframes, links, ties, config.graph)
     used = iter(after.link_used)
@@ -292,6 +326,29 @@ def _link(
         height_m=float(heights[1] - heights[0] - result.height_m),
         height_sigma_m=float(result.height_sigma_m),
     )
+
+
+# The part of the floor's unevenness along a track that stays unknown beside it.
+_UNKNOWN_RELIEF = 0.4
+
+
+def _misplacement(
+    strip: ElevationStrip, keyframes: Keyframes, keyframe: int, offset_m: FloatArray
+) -> FloatArray:
+    """Return the (2, 2) covariance by which unknown relief misplaces a square of ground.
+
+    Ground that lies h above the floor beneath the track is drawn h a / x towards it (`placed_across`). What
+    is unknown of h is taken as a part of how uneven the floor is along the track.
+    """
+    heading = float(keyframes.heading_rad[keyframe])
+    starboard = np.array([np.cos(heading), -np.sin(heading)])
+    line = int(keyframes.line[keyframe])
+    altitude = float(np.nan_to_num(strip.altitude_m[line]))
+    beneath = -(strip.depth_m + strip.altitude_m)
+    unevenness = float(np.nanstd(beneath)) if np.isfinite(beneath).any() else 0.1 * altitude
+    away = max(abs(float(offset_m @ starboard)), altitude, 1e-6)
+    sigma = _UNKNOWN_RELIEF * unevenness * altitude / away
+    return sigma**2 * np.outer(starboard, starboard)
 
 
 def _apply(

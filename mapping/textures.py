@@ -1,0 +1,294 @@
+"""What of a strip can be matched: relief, echo texture of each side, objects; and its gridding."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+from scipy.ndimage import uniform_filter
+
+from perception.records import ElevationStrip, FloatArray, Grid
+
+# Channels of a `Texture`, in the order of its last axis; heights ride along, for the offset between strips.
+RELIEF, PORT, STARBOARD, OBJECTS, HEIGHT = range(5)
+
+
+@dataclass(frozen=True, slots=True)
+class MatchConfig:
+    """How strips are compared.
+
+    Attributes
+    ----------
+    cell_m : cell of the comparison; None follows the strips' resolution.
+    highpass_m : structure wider than this is left out: it tells little about place and much about bias.
+    least_evidence : log-likelihood ratio against no match at all, beyond the logarithm of the number of
+        places looked at, below which a match is refused.
+    least_margin : log-likelihood ratio against the next best shift, likewise.
+    """
+
+    cell_m: float | None = None
+    highpass_m: float = 16.0
+    smooth_m: float = 1.0
+    least_evidence: float = 6.0
+    least_margin: float = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Texture:
+    """What of a strip can be matched: (n, m, 5) float32 values and weights, zero weight no data.
+
+    `relief_share` is the part of the relief's variance that its own sigma does not explain. `across_m`
+    (n, m) is where each cell truly lies to starboard of its line, as far as the floor's height is known.
+    """
+
+    values: FloatArray
+    weights: FloatArray
+    strip: ElevationStrip
+    relief_share: float
+    across_m: FloatArray
+
+
+def texture(
+    strip: ElevationStrip, config: MatchConfig | None = None, floor: Grid | None = None
+) -> Texture:
+    """Return what of a strip can be matched, in the strip's own frame.
+
+    relief: height less its mean over `highpass_m`, weighted by 1/sigma^2.
+    port, starboard: log echo less its mean over `highpass_m`, evened in contrast.
+    objects: spikes at the tops of hills and the middles of craters, from any side the same.
+
+    Parameters
+    ----------
+    floor : what is known of the floor so far. A strip places its echoes as if the floor were level beneath
+        each line; with it they are placed where their slant range meets it.
+    """
+    config = config or MatchConfig()
+    n, m = strip.elevation_m.shape
+    values = np.zeros((n, m, 5), np.float32)
+    weights = np.zeros((n, m, 5), np.float32)
+    size = _filter_size(strip, config.highpass_m)
+    relief_share = 0.0
+    seen = np.isfinite(strip.elevation_m) & np.isfinite(strip.sigma_m) & (strip.sigma_m > 0)
+    if seen.any():
+        # A floor keeps a few cells of great confidence from deciding alone.
+        sigma = np.where(seen, strip.sigma_m, 1.0)
+        sigma = np.maximum(sigma, np.median(sigma[seen]) * 0.5)
+        weight = np.where(seen, 1.0 / sigma**2, 0.0)
+        weight /= weight.max()
+        values[..., RELIEF] = _highpass(np.where(seen, strip.elevation_m, 0.0), weight, size)
+        weights[..., RELIEF] = weight
+        signal = float(np.average(values[..., RELIEF] ** 2, weights=weight))
+        noise = float(np.average(sigma**2, weights=weight))
+        relief_share = signal / (signal + noise)
+        values[..., HEIGHT] = np.where(seen, strip.elevation_m, 0.0)
+        weights[..., HEIGHT] = weight
+    loud = np.isfinite(strip.echo) & (strip.echo > 0) & ~strip.shadow
+    # Power is averaged before the logarithm: single looks have a long tail of darkness in logarithms.
+    fine = _filter_size(strip, config.smooth_m, least=1)
+    power = uniform_filter(
+        np.where(loud, strip.echo, 0.0).astype(np.float32), fine, mode="constant"
+    )
+    share = uniform_filter(loud.astype(np.float32), fine, mode="constant")
+    level = np.log(np.maximum(power, 1e-6) / np.maximum(share, 1e-6))
+    level = _highpass(np.clip(level, -2.0, 2.0), loud.astype(np.float32), size)
+    level = _evened(level, loud.astype(np.float32), (2 * size[0], 2 * size[1]))
+    # Near nadir an echo tells nothing about slope, and the two sides meet.
+    off_nadir = np.abs(strip.across_m) > 0.4 * np.nan_to_num(strip.altitude_m)[:, None]
+    for side, channel in ((-1, PORT), (1, STARBOARD)):
+        values[..., channel] = level
+        weights[..., channel] = loud & off_nadir & (np.sign(strip.across_m) == side)
+    values[..., OBJECTS] = _landmarks(strip, level)
+    weights[..., OBJECTS] = np.isfinite(strip.echo)
+    values[weights == 0] = 0.0
+    return Texture(values, weights, strip, relief_share, placed_across(strip, floor))
+
+
+def placed_across(strip: ElevationStrip, floor: Grid | None) -> FloatArray:
+    """Return (n, m) the signed ground range at which each cell's slant range meets the floor.
+
+    With altitude a, flat ground range x and the floor h above that beneath the line, the slant range is
+    sqrt(x^2 + a^2) and the true ground range sqrt(x^2 + a^2 - (a - h)^2): a hill is drawn towards the track
+    by h a / x, from every side towards another place. Unknown floor counts as level.
+    """
+    flat = np.broadcast_to(strip.across_m.astype(np.float32), strip.echo.shape)
+    if floor is None:
+        return np.ascontiguousarray(flat)
+    altitude = np.nan_to_num(strip.altitude_m)[:, None]
+    beneath = floor.sample(strip.easting_m, strip.northing_m)[:, None]
+    placed = flat
+    # The floor is first read at the flat place, then where that puts the cell: twice is within a cell.
+    for _ in range(2):
+        c, s = np.cos(strip.heading_rad)[:, None], np.sin(strip.heading_rad)[:, None]
+        height = floor.sample(
+            strip.easting_m[:, None] + c * placed, strip.northing_m[:, None] - s * placed
+        )
+        rise = np.clip(np.nan_to_num(height - beneath), -2.0 * altitude, 0.8 * altitude)
+        squared = flat**2 + 2.0 * altitude * rise - rise**2
+        placed = np.sign(flat) * np.sqrt(np.maximum(squared, 0.0))
+    return np.asarray(placed, np.float32)
+
+
+def _filter_size(strip: ElevationStrip, width_m: float, least: int = 3) -> tuple[int, int]:
+    step, spacing = _spacings(strip)
+    return max(least, round(width_m / step)), max(least, round(width_m / spacing))
+
+
+def _highpass(values: FloatArray, weight: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """Subtract the weighted mean over a box, so that gaps neither count nor leak."""
+    v = values.astype(np.float32)
+    w = weight.astype(np.float32)
+    mean_w = uniform_filter(w, size, mode="constant")
+    mean_v = uniform_filter(v * w, size, mode="constant")
+    return np.where(w > 0, v - mean_v / np.maximum(mean_w, 1e-6), 0.0)
+
+
+def _evened(values: FloatArray, weight: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """Divide by the rms over a box and clip: one glaring slope must not decide a whole square."""
+    mean_w = uniform_filter(weight, size, mode="constant")
+    mean_sq = uniform_filter(values**2 * weight, size, mode="constant")
+    rms = np.sqrt(mean_sq / np.maximum(mean_w, 1e-6))
+    typical = float(np.sqrt((values**2 * weight).sum() / max(float(weight.sum()), 1.0)))
+    # A floor of half the typical contrast: plain mud must not be blown up into texture.
+    return np.clip(values / np.maximum(rms, 0.5 * max(typical, 1e-6)), -2.5, 2.5)
+
+
+def _landmarks(strip: ElevationStrip, level: FloatArray) -> FloatArray:
+    """Return (n, m) a signed spike at each object's centre (hills up, craters down), else 0.
+
+    An object is a patch of shadow off the nadir that spans three lines and a square metre. A hill's shadow
+    follows its highlight, and its top lies where the shadow starts; in a crater the shadow comes first, and
+    the middle lies where it ends. Both places are the same from every side, unlike the shadow itself. A
+    spike's size grows with the shadow's, but slowly: one ridge must not outvote ten boulders.
+    """
+    n, m = strip.shadow.shape
+    spikes = np.zeros((n, m), np.float32)
+    off_nadir = np.abs(strip.across_m) > 0.6 * np.nan_to_num(strip.altitude_m)[:, None]
+    step, spacing = _spacings(strip)
+    for side in (-1, 1):
+        columns = np.flatnonzero(np.sign(strip.across_m) == side)[::side]
+        if len(columns) < 8:
+            continue
+        shadow = (strip.shadow & off_nadir)[:, columns]
+        # Single dark samples are speckle: a shadow has no holes of a sample and no lone samples.
+        shadow = uniform_filter(shadow.astype(np.float32), 3) > 0.6
+        label, count = ndimage.label(shadow)
+        if not count:
+            continue
+        area = np.bincount(label.ravel(), minlength=count + 1) * step * spacing
+        first = shadow & ~np.pad(shadow, ((0, 0), (1, 0)))[:, :-1]
+        final = shadow & ~np.pad(shadow, ((0, 0), (0, 1)))[:, 1:]
+        starts, ends = _edge_means(label, first, count), _edge_means(label, final, count)
+        reach = max(1, round(1.5 / spacing))
+        bright = uniform_filter(level[:, columns], (3, reach))
+        for k in range(1, count + 1):
+            if area[k] < 1.0 or starts[k, 2] < 3:
+                continue
+            row = int(starts[k, 0])
+            near = bright[row, max(int(starts[k, 1]) - reach, 0)]
+            far = bright[row, min(int(ends[k, 1]) + reach, len(columns) - 1)]
+            crater = far > near + 0.3
+            column = int(ends[k, 1] if crater else starts[k, 1])
+            spikes[row, columns[column]] = (-1.0 if crater else 1.0) * min(area[k], 16.0) ** 0.25
+    return spikes
+
+
+def _edge_means(
+    label: npt.NDArray[np.int32], edge: npt.NDArray[np.bool_], count: int
+) -> FloatArray:
+    """Return (count + 1, 3) mean row and column of each label's edge cells, and their number."""
+    rows, cols = np.nonzero(edge)
+    which = label[rows, cols]
+    number = np.bincount(which, minlength=count + 1).astype(float)
+    sums = [
+        np.bincount(which, v, minlength=count + 1) / np.maximum(number, 1) for v in (rows, cols)
+    ]
+    return np.stack([*sums, number], axis=1)
+
+
+def _spacings(strip: ElevationStrip) -> tuple[float, float]:
+    """Return the usual distance between lines and between columns."""
+    step = float(np.median(np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))))
+    spacing = float(np.median(np.diff(strip.across_m)))
+    return max(step, 1e-3), max(spacing, 1e-3)
+
+
+@numba.njit(cache=True)
+def scatter(
+    values: FloatArray,
+    weights: FloatArray,
+    east: FloatArray,
+    north: FloatArray,
+    heading: FloatArray,
+    across: FloatArray,
+    west: float,
+    south: float,
+    cell: float,
+    size: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Average a texture's cells into a square grid (5, size, size), row 0 south.
+
+    Each datum is shared among the four cells around it: given whole to one cell, a regular lattice of data
+    on a regular grid beats, and every match is off by up to half a datum's spacing.
+    """
+    total = np.zeros((5, size, size), np.float32)
+    weight = np.zeros((5, size, size), np.float32)
+    for i in range(values.shape[0]):
+        c, s = np.cos(heading[i]), np.sin(heading[i])
+        for j in range(values.shape[1]):
+            x = (east[i] + c * across[i, j] - west) / cell - 0.5
+            y = (north[i] - s * across[i, j] - south) / cell - 0.5
+            col, row = int(np.floor(x)), int(np.floor(y))
+            if not (0 <= col < size - 1 and 0 <= row < size - 1):
+                continue
+            fx, fy = x - col, y - row
+            for k in range(5):
+                w = weights[i, j, k]
+                if w > 0:
+                    for dy in range(2):
+                        for dx in range(2):
+                            part = w * (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
+                            total[k, row + dy, col + dx] += part * values[i, j, k]
+                            weight[k, row + dy, col + dx] += part
+    for k in range(5):
+        for row in range(size):
+            for col in range(size):
+                if weight[k, row, col] > 0:
+                    total[k, row, col] /= weight[k, row, col]
+    return total, weight
+
+
+def gather(
+    texture: Texture, corner: tuple[float, float], cell_m: float, size: int
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the texture on the square's grid (5, size, size), its weights, and its mean heading."""
+    strip = texture.strip
+    half = 0.5 * size * cell_m
+    east, north = strip.easting_m - corner[0] - half, strip.northing_m - corner[1] - half
+    along = np.abs(east * np.sin(strip.heading_rad) + north * np.cos(strip.heading_rad))
+    near = along < 1.5 * half
+    if not near.any():
+        nothing = np.zeros((5, size, size), np.float32)
+        return nothing, nothing.copy(), 0.0
+    rows = slice(int(np.argmax(near)), len(near) - int(np.argmax(near[::-1])))
+    values, weights = scatter(
+        texture.values[rows], texture.weights[rows], strip.easting_m[rows], strip.northing_m[rows],
+        strip.heading_rad[rows], texture.across_m[rows], corner[0], corner[1], cell_m, size,
+    )  # fmt: skip
+    heading = strip.heading_rad[near]
+    return values, weights, float(np.arctan2(np.sin(heading).mean(), np.cos(heading).mean()))
+
+
+def default_cell(strips: Sequence[ElevationStrip]) -> float:
+    """Return a cell for comparing: the strips' coarser spacing, at least a 250th of their width."""
+    cells = []
+    for strip in strips:
+        if len(strip.time_s) < 2 or len(strip.across_m) < 2:
+            continue
+        step = np.median(np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m)))
+        spacing = np.median(np.diff(strip.across_m))
+        cells.append(max(float(step), float(spacing), float(np.ptp(strip.across_m)) / 250.0))
+    return float(np.median(cells)) if cells else 1.0
