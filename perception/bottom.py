@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import grey_closing, median_filter, uniform_filter1d
+from scipy.ndimage import binary_erosion, grey_closing, median_filter, uniform_filter1d
 from scipy.signal import savgol_filter
 
 from perception.records import BoolArray, FloatArray
@@ -162,6 +162,10 @@ def _levels(
     image: FloatArray, track: FloatArray, first_cell: int
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return log level of water and of near floor per cell of range, and their spread."""
+    # A ping without echo would teach a water far darker than the others'.
+    taught = _is_valid(_edge_contrast(image, track, first_cell))
+    if taught.any():
+        image, track = image[taught], track[taught]
     n, cells = image.shape
     k = np.arange(cells)
     water, floor = np.full(cells, np.nan), np.full(cells, np.nan)
@@ -348,7 +352,10 @@ def _assemble(
     sigma_m = np.hypot(sigma.mean(axis=0) / np.sqrt(len(firsts)), 0.5 * (later - first)) * sample_m
     altitude_m, first_m = altitude * sample_m, first * sample_m
     if valid.any() and not valid.all():
-        altitude_m, first_m, sigma_m = _carried(altitude_m, first_m, sigma_m, valid, hint_m)
+        # Smoothing reached into the pings beside a dropout.
+        clear = binary_erosion(valid, np.ones(config.smooth_pings // 2 * 2 + 1), border_value=1)
+        clear = clear if clear.any() else valid
+        altitude_m, first_m, sigma_m = _carried(altitude_m, first_m, sigma_m, clear, hint_m)
     return BottomTrack(altitude_m, sigma_m, first_m, valid)
 
 
@@ -397,14 +404,15 @@ def _below_objects(track: BottomTrack, sides: list[FloatArray], sample_m: float)
 
     Such an object makes a short dip in the track, while the floor's own edge still stands at the
     range the track has on either side of the dip. Dips are found by closing the track (largest, then
-    least value over a stretch); the edge decides whether the floor goes through beneath.
+    least value over a stretch); the edge decides whether the floor goes through beneath. Dips of less
+    than eight samples are left: the object's own edge would be taken for the floor's.
     """
     n = len(track.altitude_m)
     samples = track.altitude_m / sample_m
     window = min(n, _DIP_PINGS) | 1
     closed = grey_closing(samples, window, mode="nearest")
     sigma = track.sigma_m / sample_m
-    dip = closed - samples > np.maximum(3 * sigma, 2.5)
+    dip = closed - samples > np.maximum(3 * sigma, 8.0)
     if not dip.any():
         return track
     m = sides[0].shape[1]

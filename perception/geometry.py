@@ -76,13 +76,12 @@ def resample_rows(power, sample_m, common_m, n_out):  # type: ignore[no-untyped-
     for i in range(n):
         for k in range(n_out):
             position = (k + 0.5) * common_m / sample_m[i] - 0.5
-            if position < 0.0:
-                position = 0.0
-            low = int(position)
+            low = max(int(np.floor(position)), 0)
             if low >= m or (low == m - 1 and position > m - 0.5):
                 continue
             high = min(low + 1, m - 1)
-            f = position - low
+            # Half a sample before the first centre the first one is held.
+            f = max(position - low, 0.0)
             value = power[i, low]
             if f > 0 and not np.isnan(power[i, high]):
                 value = (1 - f) * value + f * power[i, high]

@@ -33,7 +33,7 @@ class LevelConfig:
     nominal_db: float = 2.5
     highlight_db: float = 5.0
     shadow_db: float = 7.0
-    change_cost: float = 3.0
+    change_cost: float = 4.5
 
 
 @dataclass(frozen=True, slots=True)
