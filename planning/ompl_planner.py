@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -95,7 +96,11 @@ def _planner(name: str, si: ob.SpaceInformation, iterations: int) -> ob.Planner:
 
 
 def plan_in_corridor(
-    corridor: Corridor, planner: str, seed: int, iterations: int | None = None
+    corridor: Corridor,
+    planner: str,
+    seed: int,
+    iterations: int | None = None,
+    seconds: float = math.inf,
 ) -> Found | None:
     """Let an OMPL planner improve on the guide; None where it finds nothing.
 
@@ -104,6 +109,7 @@ def plan_in_corridor(
     planner : bitstar, rrtstar, informed, sorrt or fmt.
     seed : non-negative; the path depends on it and on `iterations` alone.
     iterations : None takes what lasts about a second.
+    seconds : stop by the clock as well, for comparisons; such a run does not repeat to the bit.
     """
     n = ITERATIONS.get(planner, 1000) if iterations is None else iterations
     ou.setLogLevel(ou.LogLevel.LOG_NONE)
@@ -137,9 +143,11 @@ def plan_in_corridor(
     # FMT* asks once per sample before it begins; its own end is when its tree is grown.
     left = [20 * n if planner == "fmt" else n]
 
+    until = time.perf_counter() + seconds
+
     def enough() -> bool:
         left[0] -= 1
-        return left[0] < 0
+        return left[0] < 0 or time.perf_counter() > until
 
     solver.solve(ob.PlannerTerminationCondition(enough))
     if not problem.hasExactSolution():

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 BENCHMARKS: dict[str, tuple[str, str]] = {
     "experiments": ("experiments", "the experiment runner: overhead, memory, sameness"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
+    "planning": ("planning", "Routes: cost against the grid search, parts switched off, peers."),
 }
 
 
