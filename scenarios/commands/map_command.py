@@ -102,7 +102,36 @@ def _write(out: Path, survey: Survey, result: SurveyMap, prior: Path | None) -> 
     plot_map(out / "map.png", result.grid, result.raw_track, result.track)
     if result.grid.sigma_m is not None:
         plot_layer(out / "sigma.png", result.grid, result.grid.sigma_m, "1-sigma, m", "magma")
-    return {}
+    return _metrics(survey, result)
+
+
+def _metrics(survey: Survey, result: SurveyMap) -> dict[str, Any]:
+    import numpy as np
+
+    grid, said = result.grid, result.corrected.diagnostics
+    seen = np.isfinite(grid.elevation_m)
+    last = said.rounds[-1] if said.rounds else None
+    return {
+        "pings": survey.n_pings,
+        "pings_used": int((survey.pings.pass_index >= 0).sum()),
+        "passes": survey.n_passes,
+        "objects": sum(len(p.objects) for p in result.passes),
+        "cell_m": grid.cell_m,
+        "cells": int(seen.sum()),
+        "area_m2": float(seen.sum() * grid.cell_m * grid.cell_north_m),
+        "elevation_min_m": float(np.min(grid.elevation_m[seen])),
+        "elevation_max_m": float(np.max(grid.elevation_m[seen])),
+        "sigma_median_m": None if grid.sigma_m is None else float(np.median(grid.sigma_m[seen])),
+        "registrations_compared": 0 if last is None else last.compared,
+        "registrations_accepted": 0 if last is None else last.accepted,
+        "registrations_used": 0 if last is None else last.used,
+        "rounds": len(said.rounds),
+        "fixes_used": said.fixes_used,
+        "fixes_refused": said.fixes_refused,
+        "largest_correction_m": said.largest_correction_m,
+        "track_indeterminate": said.indeterminate,
+        "track_worsened": said.worsened,
+    }
 
 
 def _write_soundings(path: Path, result: SurveyMap) -> None:
