@@ -16,6 +16,7 @@ _HELD_SHARE = (
     0.3  # positions equal to the one before in more pings than this are held between fixes
 )
 _REACH_S = 5.0  # positions are extrapolated no longer than this
+_CRAB_RAD = np.radians(25.0)
 _SPIKE_M = 50.0  # a position this far (and 20 usual steps) from its neighbours' median is wrong
 
 
@@ -206,12 +207,25 @@ def mend_headings(
         defects.append("no heading recorded: the course of the track is taken")
         return course, filled
     heading = true_heading_rad - convergence_rad
+    _tell_crabbing(heading[~wrong], course[~wrong], defects)
     if np.any(wrong & ~told):
         defects.append(f"no heading in {plural(int((wrong & ~told).sum()), 'ping')}: interpolated")
     if wrong.any():
         rows = np.arange(len(heading))
         heading[wrong] = np.interp(rows[wrong], rows[~wrong], np.unwrap(heading[~wrong]))
     return heading, wrong
+
+
+def _tell_crabbing(heading_rad: FloatArray, course_rad: FloatArray, defects: list[str]) -> None:
+    """Tell of headings that are not where the track goes: no current explains more than this."""
+    apart = (heading_rad - course_rad)[np.isfinite(heading_rad + course_rad)]
+    off = np.mean(np.exp(1j * apart)) if len(apart) else np.nan
+    # A track that goes nowhere (turning in place, noise) has no mean difference worth telling.
+    if np.isfinite(off) and abs(off) > 0.7 and abs(np.angle(off)) > _CRAB_RAD:
+        defects.append(
+            f"headings lie {np.degrees(np.angle(off)):.0f} deg off the track on average: kept as "
+            "recorded; a declination or mounting angle belongs in install.toml"
+        )
 
 
 def _runs_north(course: FloatArray) -> bool:

@@ -183,6 +183,8 @@ class Walker:
         self._stream.seek(at)
         start = self._stream.read(_START.size)
         magic, kind, _, n_channels, _, _, length = _START.unpack(start)
+        if magic == 0xFACE and kind == SONAR and length < _PING_BYTES:
+            length = self._implied_length(at, n_channels)
         sound = magic == 0xFACE and _START.size <= length <= _MOST_BYTES
         if sound and at + length > self._size:
             if self._magic_after(at + 2) is None:
@@ -197,6 +199,19 @@ class Walker:
         if not self._take(at, kind, n_channels, length):
             return self._resync(at + 1)
         return at + length
+
+    def _implied_length(self, at: int, n_channels: int) -> int:
+        """Return the length that the channel headers imply, for writers that leave the field empty.
+
+        0 where no packet and no end of the file follows there.
+        """
+        records = self._channel_records(at, n_channels, min(self._size - at, _MOST_BYTES), False)
+        if not records:
+            return 0
+        _, data, size = records[-1]
+        self._stream.seek(data + size)
+        following = self._stream.read(2)
+        return data + size - at if following in (MAGIC, b"") else 0
 
     def _take(self, at: int, kind: int, n_channels: int, length: int) -> bool:
         if kind == SONAR:
@@ -233,25 +248,36 @@ class Walker:
             self._waiting = []
 
     def _channel_records(
-        self, at: int, n_channels: int, length: int
+        self, at: int, n_channels: int, length: int, length_known: bool = True
     ) -> list[tuple[bytes, int, int]] | None:
-        """Return (channel header, offset and bytes of its samples) of one ping; None if unfit."""
+        """Return (channel header, offset and bytes of its samples) of one ping; None if unfit.
+
+        A count of samples left empty follows from the packet's length, where that is known.
+        """
         if n_channels == 0:
             n_channels = int(self.header.NumberOfSonarChannels)
-        records = []
+        records: list[tuple[bytes, int, int]] = []
+        numbers: set[int] = set()
         inside = _PING_BYTES
-        for _ in range(n_channels):
+        for place in range(n_channels):
             if inside + _CHANNEL_BYTES > length:
                 return None
             self._stream.seek(at + inside)
             record = self._stream.read(_CHANNEL_BYTES)
             number = int.from_bytes(record[:2], "little")
+            if number in numbers:
+                # Careless writers leave every channel's number 0: then its place counts.
+                number = place
+                record = number.to_bytes(2, "little") + record[2:]
+            numbers.add(number)
             count = int.from_bytes(record[_CHANNEL_COUNT_AT : _CHANNEL_COUNT_AT + 4], "little")
             inside += _CHANNEL_BYTES
             room = length - inside
             each = self._bytes.get(number)
             if each is None:
                 each = self._settle_bytes(number, count, room, n_channels)
+            if count == 0 and not length_known:
+                return None
             if count == 0:
                 # Old recorders leave the count to the size of the packet.
                 count = (room - (n_channels - 1) * _CHANNEL_BYTES) // (each * n_channels)

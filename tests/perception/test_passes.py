@@ -66,6 +66,21 @@ def test_a_slow_curve_stays_one_pass(turn_deg):
     assert lengths(split) == [len(track.time_s)]
 
 
+def test_lines_that_follow_each_other_without_a_turn_are_passes_of_their_own():
+    """Simulators step from one line's end to the next one's start, 15 m aside and facing back."""
+    up = track_of([(100, 0)])
+    n = len(up.time_s)
+    split = split_passes(
+        Track(0.2 * np.arange(3 * n), np.repeat([0.0, 15.0, 30.0], n),
+              np.concatenate([up.northing_m, up.northing_m[::-1], up.northing_m]),
+              np.repeat([0.0, np.pi, 0.0], n), np.full(3 * n, 30.0), np.full(3 * n, 512))
+    )  # fmt: skip
+    assert split.pass_index.max() == 2
+    assert all(count > 0.9 * n for count in lengths(split))
+    for number in range(3):
+        assert np.ptp(np.flatnonzero(split.pass_index == number) // n) == 0
+
+
 def test_a_kink_of_twenty_degrees_is_no_turn():
     assert split_passes(track_of([(100, 0), (2, 20), (100, 0)])).pass_index.max() == 0
 

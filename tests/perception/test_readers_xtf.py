@@ -323,6 +323,41 @@ def test_two_channels_without_a_type_are_taken_for_port_and_starboard(tmp_path):
     assert_allclose(np.median(swath.starboard) / np.median(swath.port), 2.0, rtol=0.1)
 
 
+def test_channels_that_all_call_themselves_0_count_by_their_place(tmp_path):
+    def tweak(i, ping, channels):
+        channels[1].ChannelNumber = 0
+
+    swath = open_survey([make_xtf(tmp_path / "a.xtf", Plan(tweak=tweak))]).swath(0)
+    assert_allclose(np.median(swath.starboard) / np.median(swath.port), 2.0, rtol=0.1)
+
+
+def test_packets_that_do_not_state_their_length_are_read(tmp_path):
+    header, *packets = xtf_packets(Plan())
+    for i, packet in enumerate(packets):
+        packets[i] = packet[:10] + bytes(4) + packet[14 : 256 + 2 * (64 + 512)]
+    path = tmp_path / "a.xtf"
+    path.write_bytes(header + b"".join(packets))
+    survey = open_survey([path])
+    assert survey.n_pings == 60 and not said(survey, "corrupt")
+
+
+def test_lengths_that_count_a_padding_which_is_not_there_cost_no_ping(tmp_path):
+    header, *packets = xtf_packets(Plan(samples=250))
+    path = tmp_path / "a.xtf"
+    path.write_bytes(header + b"".join(p[: 256 + 2 * (64 + 500)] for p in packets))
+    survey = open_survey([path])
+    assert survey.n_pings >= 59
+
+
+def test_headings_far_off_the_track_are_told_and_kept(tmp_path):
+    def tweak(i, ping, channels):
+        ping.SensorHeading = 60.0
+
+    survey = open_survey([make_xtf(tmp_path / "a.xtf", Plan(tweak=tweak))])
+    assert said(survey, "60 deg off the track")
+    assert abs(np.degrees(survey.pings.heading_rad[0]) - 60.0) < 1.0
+
+
 def test_a_single_side_leaves_the_other_empty(tmp_path):
     survey = open_survey([make_xtf(tmp_path / "a.xtf", Plan(channel_types=(2,)))])
     swath = survey.swath(0)
