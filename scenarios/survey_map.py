@@ -25,12 +25,13 @@ from perception.records import (
     ElevationStrip,
     FloatArray,
     Grid,
+    InputError,
     Progress,
     Swath,
     Trajectory,
     silent,
 )
-from perception.strips import PassResult, build_strip, common_samples
+from perception.strips import PassResult, StripConfig, build_strip, common_samples
 
 if TYPE_CHECKING:
     from perception.inversion import InversionResult, Look
@@ -140,26 +141,39 @@ _recent: dict[tuple[object, ...], tuple[PassSummary, ...]] = {}
 def build_passes(
     survey: Survey,
     progress: Progress = silent,
-    tell: Callable[[int, Swath, PassResult], None] | None = None,
+    config: StripConfig | None = None,
+    tell: Callable[[int, PassResult], None] | None = None,
 ) -> tuple[PassSummary, ...]:
     """Turn every pass into a strip, reading one pass at a time.
 
     Parameters
     ----------
-    tell : called with the number, the swath and the whole result of each pass, before it is let go.
+    tell : called with the number and the whole result of each pass, before it is let go.
+
+    Raises
+    ------
+    InputError
+        No pass gives a strip; single ones that do not are left out with a warning.
     """
-    key = _identity(survey)
+    key = (*_identity(survey), config)
     if tell is None and key in _recent:
         return _recent[key]
-    results = []
+    results: list[PassSummary] = []
+    refused: list[str] = []
     for index in range(survey.n_passes):
         progress("echoes to strips", index, survey.n_passes)
-        swath = survey.swath(index)
-        result = build_strip(swath)
+        try:
+            result = build_strip(survey.swath(index), config)
+        except InputError as error:
+            refused.append(str(error))
+            logger.warning("%s; left out", error)
+            continue
         if tell is not None:
-            tell(index, swath, result)
+            tell(index, result)
         results.append(PassSummary.of(result))
     progress("echoes to strips", survey.n_passes, survey.n_passes)
+    if not results:
+        raise InputError(refused[0] if refused else "the survey holds no pass to make a strip of")
     _recent.clear()
     _recent[key] = tuple(results)
     return _recent[key]
@@ -252,7 +266,7 @@ def _look(
     """Return one pass as the joint inversion sees it: on one sample size, at corrected poses."""
     from perception.inversion import Look
 
-    swath = survey.swath(index)
+    swath = survey.swath(result.strip.pass_index)
     port_power, starboard_power, sample_m = common_samples(swath)
     swath = replace(
         swath,

@@ -57,43 +57,31 @@ def command(
     from perception.installation import read_installation
     from perception.objects import ObjectTable, write_objects_csv
     from perception.readers import open_survey
-    from perception.records import InputError
     from perception.strip_files import write_strip
-    from perception.strips import StripConfig, build_strip
+    from perception.strips import StripConfig
     from scenarios.outputs import write_metrics
     from scenarios.plots_strips import plot_pass
+    from scenarios.survey_map import build_passes
 
     set_verbosity(quiet, verbose)
     prepare_out(out)
     _clear(out)
-    config = StripConfig(cell_m=cell)
+    config = None if cell is None else StripConfig(cell_m=cell)
     installation = read_installation(install, tide, sound_speed)
     began = time.perf_counter()
-    tables: list[ObjectTable] = []
     measured: dict[str, float] = {}
-    refused: list[str] = []
     with progress_bars(quiet) as progress:
         survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
         for warning in survey.warnings:
             click.echo(f"note: {warning}", err=True)
-        # One pass in memory at a time: a survey may be larger than memory.
-        for index in range(survey.n_passes):
-            progress("echoes to strips", index, survey.n_passes)
-            try:
-                result = build_strip(survey.swath(index), config)
-            except InputError as error:
-                refused.append(str(error))
-                click.echo(f"note: {error}; left out", err=True)
-                continue
+
+        def write(index: int, result: PassResult) -> None:
             write_strip(out / f"strip-{index:03d}.nc", result.strip, survey.utc)
             plot_pass(out / f"strip-{index:03d}.png", result)
-            tables.append(result.objects)
             _add_up(measured, result)
-        progress("echoes to strips", survey.n_passes, survey.n_passes)
-    if not tables:
-        raise InputError(
-            refused[0] if refused else f"{surveys[0]}: holds no pass to make a strip of"
-        )
+
+        # One pass in memory at a time: a survey may be larger than memory.
+        tables = [p.objects for p in build_passes(survey, progress, config, write)]
     objects = ObjectTable.joined(tables)
     write_objects_csv(out / "objects.csv", objects)
     metrics = _metrics(measured, objects, len(tables), time.perf_counter() - began)
