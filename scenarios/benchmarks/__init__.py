@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 # name -> (module below scenarios.benchmarks, what it measures)
 BENCHMARKS: dict[str, tuple[str, str]] = {
     "experiments": ("experiments", "the experiment runner: overhead, memory, sameness"),
+    "sonar-files": ("sonar_files", "reading sonar files: pings a second, memory at 1x and 10x"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
     "planning": ("planning", "Routes: cost against the grid search, parts switched off, peers."),
 }
