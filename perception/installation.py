@@ -192,11 +192,12 @@ def read_installation(
     return installation
 
 
-def _sound(text: str) -> dict[str, Any]:
+def _sound(text: str, folder: Path = Path()) -> dict[str, Any]:
+    """Return the setting for a speed, or for a profile's name as seen from `folder`."""
     try:
         speed = float(text)
     except ValueError:
-        return {"sound_profile": read_profile(Path(text))}
+        return {"sound_profile": read_profile(folder / text)}
     if not _SLOWEST_M_S <= speed <= _FASTEST_M_S:
         raise InputError(
             f"--sound-speed {text}: must lie between {_SLOWEST_M_S:g} and {_FASTEST_M_S:g} m/s; "
@@ -266,7 +267,7 @@ def _from_toml(path: Path) -> Installation:
     sections: dict[str, Any] = {}
     for name, content in read_toml(path).items():
         if name == "sound_speed":
-            sections |= _sound(str(content))
+            sections |= _sound(str(content), path.parent)
             continue
         kind = _SECTIONS.get(name)
         if kind is None:

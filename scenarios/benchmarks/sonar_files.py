@@ -8,7 +8,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +53,7 @@ def run(progress: Progress) -> Table:
         for number, times in enumerate((1, _TIMES)):
             path = Path(folder) / f"{times}.xtf"
             n = times * _PINGS
-            _write(path, n, lambda done, n=n: progress("writing", done, n))
+            _write(path, n, progress)
             case = f"{n:,} pings of 2 x {_SAMPLES:,}"
             progress("reading", number, 2)
             scan, samples, grown = _measured(_OURS, path)
@@ -85,7 +84,7 @@ def _measured(program: str, path: Path) -> tuple[float, float, float]:
     return first, second, grown
 
 
-def _write(path: Path, n: int, told: Callable[[int], None]) -> None:
+def _write(path: Path, n: int, progress: Progress) -> None:
     """Write lines of 400 m, 40 m apart, up and down, 5 Hz at 2 m/s; the echoes are noise."""
     rng = np.random.default_rng(0)
     header = XTFFileHeader()
@@ -103,7 +102,7 @@ def _write(path: Path, n: int, told: Callable[[int], None]) -> None:
         for i in range(n):
             stream.write(_ping(i, per_line, echoes[i % 64]))
             if i % 5000 == 0:
-                told(i)
+                progress("writing", i, n)
 
 
 def _ping(i: int, per_line: int, echo: np.ndarray) -> bytes:

@@ -219,6 +219,14 @@ def test_a_profile_file_and_a_value_are_told_apart(tmp_path):
     assert read_installation() is None
 
 
+def test_a_profile_in_install_toml_is_named_from_beside_it(tmp_path):
+    write(tmp_path / "p.csv", "depth_m,speed_m_s\n0,1520\n50,1480\n")
+    install = write(tmp_path / "install.toml", 'sound_speed = "p.csv"\n')
+    assert_allclose(read_installation(install).sound_profile.value, [1520, 1480])
+    # The option has the last word.
+    assert read_installation(install, sound_speed="1490").sound_profile is None
+
+
 def test_a_fixed_depth_is_the_sonars_own(tmp_path):
     install = write(tmp_path / "i.toml", "[sonar]\ndepth_m = 0.7\noffset_m = [0, 0, 3]\n")
     survey = open_survey([make_xtf(tmp_path / "a.xtf")], installation=read_installation(install))
