@@ -26,22 +26,23 @@ from localization.view import DEPTH, EAST, NORTH, SCALE, TURN, View
 from perception.records import BoolArray, FloatArray, IntArray
 
 # Random walks of dead reckoning to choose among, m per square root of an hour, and their prior
-# weights: from a DVL-aided inertial system to one that slips or drifts with unmeasured currents.
-_WALKS_M_SQRT_H = {0.5: 0.3, 2.0: 0.3, 7.0: 0.25, 25.0: 0.15}
+# weights: from errors that are constant, as nav.csv's defaults have them, to a vehicle that slips or
+# drifts with unmeasured currents.
+_WALKS_M_SQRT_H = {0.1: 0.65, 0.7: 0.15, 3.0: 0.1, 12.0: 0.1}
 # Correlation lengths to choose among beside the split that the map's spectrum suggests.
 _LENGTHS_M = (30.0, 150.0)
-_USUAL_WALK_M_SQRT_H = 2.0
+_USUAL_WALK_M_SQRT_H = 0.7
 # Ranges may be noisier than stated: half the bank's members for it, at this factor.
 _NOISIER = 2.0
 # More beams than this and the map's error is inflated instead of carried for each.
 _MOST_BEAMS = 8
 # A residual this many sigmas out is not used: with Gaussian noise one in 16,000.
 _GATE = 4.0
-# Evidence is forgotten over some hundred updates, so that a change can be followed.
-_MEMORY = 0.995
-# Heading bias and scale wander a little: degrees per square root of an hour, and a part of 1.
-_TURN_WALK_RAD_SQRT_H = np.radians(0.02)
-_SCALE_WALK_SQRT_H = 2e-4
+# Evidence is forgotten over a thousand updates, so that a change can be followed in time.
+_MEMORY = 0.999
+# Heading bias and scale wander with the position: radians and parts of 1 for each metre of its walk.
+_TURN_PER_WALK = float(np.radians(0.015))
+_SCALE_PER_WALK = 2e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +143,8 @@ class TerrainKalman:
         f[5:, 5:] *= keep
         q = np.zeros((size, size))
         q[EAST, EAST] = q[NORTH, NORTH] = self.assumed.walk_m2_s * seconds
-        q[TURN, TURN] = _TURN_WALK_RAD_SQRT_H**2 * seconds / 3600.0
-        q[SCALE, SCALE] = _SCALE_WALK_SQRT_H**2 * seconds / 3600.0
+        q[TURN, TURN] = _TURN_PER_WALK**2 * self.assumed.walk_m2_s * seconds
+        q[SCALE, SCALE] = _SCALE_PER_WALK**2 * self.assumed.walk_m2_s * seconds
         q[DEPTH, DEPTH] = tide_m2
         q[5:, 5:] = (1 - keep**2) * self.assumed.shared_m**2 * np.eye(self.beams)
         self.filter.F, self.filter.Q = f, q

@@ -20,7 +20,9 @@ from localization.terrain import TerrainMap, terrain_map
 from mapping.fixes import write_fixes
 from mapping.rasters import read_map
 from mapping.trajectories import write_trajectory
-from perception.records import Grid, Progress
+from perception.geodesy import convergence, is_local
+from perception.records import Grid, InputError, Progress
+from scenarios.locating_swath import nav_of_survey, open_side_scan, patch_fixes
 
 logger = logging.getLogger(__name__)
 
@@ -33,12 +35,13 @@ class LocateOptions:
     """The options of `bathynav locate`; see its help."""
 
     prior: Path
-    nav: Path
+    nav: Path | None = None
     sensors: Path | None = None
     map_sigma_m: float | None = None
     map_error_length_m: float | None = None
     particles: int = 4000
     seed: int = 0
+    swath: tuple[Path, ...] = ()
 
 
 def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, Any]:
@@ -53,8 +56,15 @@ def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, A
     from scenarios.plots_navigation import draw_navigation
 
     began = time.perf_counter()
-    nav = read_nav(options.nav, None if options.sensors is None else read_sensors(options.sensors))
     prior, sigma_source = prior_with_sigma(options.prior, options.map_sigma_m)
+    sensors = None if options.sensors is None else read_sensors(options.sensors)
+    survey = open_side_scan(options.swath, prior.crs, progress) if options.swath else None
+    if options.nav is not None:
+        nav = on_grid(read_nav(options.nav, sensors), prior.crs)
+    elif survey is not None:
+        nav = nav_of_survey(survey, sensors or Sensors())
+    else:
+        raise InputError("locate needs --nav NAV.csv, --swath SURVEY, or both")
     terrain = terrain_map(prior, options.map_error_length_m, reach(nav))
     check_against_map(nav, float(np.nanmedian(terrain.height_m)))
     navigator = Navigator(
@@ -63,16 +73,38 @@ def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, A
         np.random.default_rng(options.seed),
         NavigatorConfig(particles=options.particles),
     )
-    result = navigate(navigator, nav, crs=prior.crs, progress=progress)
+    fixes = [] if survey is None else patch_fixes(survey, terrain, nav, progress)
+    result = navigate(navigator, nav, fixes, crs=prior.crs, progress=progress)
     metrics = summary(result, nav, terrain)
     metrics["map_sigma_source"] = sigma_source
     metrics["seconds"] = round(time.perf_counter() - began, 3)
-    write_trajectory(out / "trajectory.csv", result.trajectory)
-    write_trajectory(out / "trajectory-smoothed.csv", result.smoothed)
+    # Files have headings as the input did.
+    told = None if options.nav is None else read_nav(options.nav, sensors).heading_rad
+    for name, track in (
+        ("trajectory", result.trajectory),
+        ("trajectory-smoothed", result.smoothed),
+    ):
+        as_read = track if told is None else replace(track, heading_rad=told)
+        write_trajectory(out / f"{name}.csv", as_read)
     write_fixes(out / "fixes.csv", result.fixes)
     draw_navigation(out / "locate.png", prior, nav, result.trajectory, result.smoothed)
     write_metrics(out, metrics, _config(options, nav.sensors), options.seed)
     return metrics
+
+
+def on_grid(nav: NavTable, crs: str) -> NavTable:
+    """Turn headings from true north, as files have them, to grid north."""
+    if is_local(crs):
+        return nav
+    placed = np.isfinite(nav.easting_m) & np.isfinite(nav.northing_m)
+    turn = convergence(
+        np.array([np.median(nav.easting_m[placed])]), np.array([np.median(nav.northing_m[placed])]),
+        crs,
+    )  # fmt: skip
+    # A place outside the CRS's domain has no convergence; nothing is known to correct then.
+    return replace(
+        nav, heading_rad=nav.heading_rad - (float(turn[0]) if np.isfinite(turn[0]) else 0.0)
+    )
 
 
 def prior_with_sigma(path: Path, sigma_m: float | None) -> tuple[Grid, str]:
@@ -156,3 +188,48 @@ def _verdict(result: Navigation, converged: bool) -> str:
 
 def _config(options: LocateOptions, sensors: Sensors) -> dict[str, Any]:
     return {**asdict(options), "sensors_resolved": asdict(sensors)}
+
+
+def observe(
+    prior: Path,
+    out: Path,
+    sensors: Path | None,
+    map_sigma_m: float | None,
+    map_error_length_m: float | None,
+    altitude_m: float,
+    path_m: float,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Run `locate --observability`: the bound on a fix's error for every cell, as map and picture."""
+    from localization.observability import ObservabilityConfig, as_grid, observability
+    from mapping.rasters import write_bands
+    from scenarios.outputs import write_metrics
+    from scenarios.plots_navigation import draw_observability
+
+    began = time.perf_counter()
+    grid, source = prior_with_sigma(prior, map_sigma_m)
+    terrain = terrain_map(grid, map_error_length_m)
+    chosen = Sensors() if sensors is None else read_sensors(sensors)
+    config = ObservabilityConfig(path_m=path_m, altitude_m=altitude_m)
+    found = observability(terrain, chosen, config, progress)
+    bands = {
+        "sigma_best": found.best_m, "sigma_mean": found.mean_m, "sigma_worst": found.worst_m,
+        "best_heading_deg": np.degrees(found.best_heading_rad),
+    }  # fmt: skip
+    headings = np.degrees(found.headings_rad)
+    bands |= {
+        f"sigma_{h:05.1f}": layer for h, layer in zip(headings, found.by_heading_m, strict=True)
+    }
+    write_bands(out / "observability.tif", bands, as_grid(terrain, found.mean_m, grid.crs))
+    draw_observability(out / "observability.png", grid, found)
+    metrics = {
+        "sigma_best_median_m": float(np.nanmedian(found.best_m)),
+        "sigma_mean_median_m": float(np.nanmedian(found.mean_m)),
+        "sigma_worst_median_m": float(np.nanmedian(found.worst_m)),
+        "share_below_10_m": float(np.nanmean(found.mean_m[np.isfinite(found.mean_m)] < 10.0)),
+        "map_sigma_source": source,
+        "seconds": round(time.perf_counter() - began, 3),
+    }
+    settings = {"map": prior, "sensors_resolved": asdict(chosen), **asdict(config)}
+    write_metrics(out, metrics, settings)
+    return metrics

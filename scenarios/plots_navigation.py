@@ -10,8 +10,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 
 from localization.navfile import NavTable
+from localization.observability import Observability
 from perception.files import whole_file
 from perception.records import Grid, Trajectory
 
@@ -120,3 +122,32 @@ def _draw_offset(axes: Axes, nav: NavTable, causal: Trajectory, smoothed: Trajec
     axes.set_ylabel("offset (m)")
     axes.legend(fontsize=8)
     axes.set_title("Offset from dead reckoning (dotted: smoothed)")
+
+
+def draw_observability(path: Path, prior: Grid, found: Observability) -> None:
+    """Draw `observability.png`: the ground, the bound on a fix's error, and the best heading."""
+    figure, axes = plt.subplots(1, 3, figsize=(15, 5), constrained_layout=True)
+    every = max(1, max(prior.shape) // 800)
+    extent = (prior.west_m, prior.east_m, prior.south_m, prior.north_m)
+    bound = found.mean_m[::every, ::every]
+    # Rounded to halves of a decade, so that the scale reads.
+    known = bound[np.isfinite(bound)]
+    low, high = (np.percentile(known, [1, 99])) if known.size else (1.0, 10.0)
+    layers = (
+        (prior.elevation_m[::every, ::every], "viridis", None, "elevation (m)"),
+        (bound, "magma_r", LogNorm(max(low, 1e-3), max(high, low * 1.5)), "1-sigma of a fix (m)"),
+        (np.degrees(found.best_heading_rad[::every, ::every]), "twilight", None,
+         "heading of least sigma (deg)"),
+    )  # fmt: skip
+    for panel, (values, colours, norm, label) in zip(axes, layers, strict=True):
+        image = panel.imshow(
+            values, extent=extent, cmap=colours, norm=norm, interpolation="nearest"
+        )
+        figure.colorbar(image, ax=panel, label=label, shrink=0.75)
+        panel.set_xlabel("easting (m)")
+        panel.ticklabel_format(useOffset=False, style="plain")
+        panel.tick_params(axis="x", labelrotation=30)
+    axes[0].set_ylabel("northing (m)")
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+    plt.close(figure)
