@@ -108,7 +108,7 @@ def segment(
     if not np.isfinite(grid.elevation_m).any():
         raise InputError("the map holds no height at all (every cell is NaN); nothing to segment")
     progress("regions", 0, 1 + config.levels)
-    smoothing = _smooth(grid, config.scale_m, config.operator)
+    smoothing = _smooth(grid, config)
     curvature = _curvature(grid, smoothing)
     progress("regions", 1, 1 + config.levels)
     finest = _regions(grid, curvature, config)
@@ -117,9 +117,9 @@ def segment(
     parents: list[npt.NDArray[np.int64]] = []
     below = finest
     for level in range(1, config.levels):
-        scale_m = _level_scale(smoothing, grid, level)
-        coarse_config = replace(config, scale_m=scale_m, keep_probability=False)
-        rough = _curvature(grid, _smooth(grid, scale_m, config.operator))
+        coarse_config = replace(config, keep_probability=False)
+        least_scale_m = _level_scale(smoothing, grid, level)
+        rough = _curvature(grid, _smooth(grid, config, least_scale_m))
         regions = _regions(grid, rough, coarse_config)
         parents.append(_parents(below, regions))
         coarser.append(regions)
@@ -128,9 +128,20 @@ def segment(
     return Segmentation(finest, curvature, tuple(coarser), tuple(parents))
 
 
-def _smooth(grid: Grid, scale_m: float | None, operator: Operator) -> Smoothing:
-    cells = (grid.cell_m, grid.cell_north_m)
-    return smooth(grid.elevation_m, *cells, grid.sigma_m, scale_m, operator)
+def _smooth(grid: Grid, config: RegionConfig, least_scale_m: float = 0.0) -> Smoothing:
+    """Smooth by the configured scale; a coarser level by no less than its own."""
+    scale_m = config.scale_m
+    if scale_m is not None:
+        scale_m = max(scale_m, least_scale_m)
+    return smooth(
+        grid.elevation_m,
+        grid.cell_m,
+        grid.cell_north_m,
+        grid.sigma_m,
+        scale_m,
+        config.operator,
+        least_scale_m,
+    )
 
 
 def _level_scale(smoothing: Smoothing, grid: Grid, level: int) -> float:

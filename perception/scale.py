@@ -96,6 +96,7 @@ def smooth(
     sigma_m: FloatArray | None = None,
     scale_m: float | None = None,
     operator: Operator = "difference",
+    least_scale_m: float = 0.0,
 ) -> Smoothing:
     """Smooth a map and differentiate it.
 
@@ -107,13 +108,16 @@ def smooth(
     scale_m : one scale for the whole map (Gaussian sigma or equivalent, 0 for none) instead of
         one chosen per cell.
     operator : the 3 x 3 derivative of the map's own cells.
+    least_scale_m : where the scale is chosen per cell, none finer than this is taken.
     """
     flat, slope = _less_plane(z, cell_m, cell_north_m)
-    noise = independent_noise(flat, sigma_m, _STEP)
+    noise = np.maximum(independent_noise(flat, sigma_m, _STEP), _rounding(z, flat))
     quadrature = _Quadrature(cell_m, cell_north_m, operator)
     rim = _rim_distance(flat, noise.shape)
     if scale_m is None:
-        stack, weights = _weigh(_stack(flat, quadrature), noise, rim, quadrature)
+        least_width = _equivalent_width(least_scale_m, quadrature)
+        scales = _stack(flat, quadrature)
+        stack, weights = _weigh(scales, noise, rim, quadrature, least_width)
     else:
         stack = [_only_scale(flat, quadrature, _equivalent_width(scale_m, quadrature))]
         weights = np.ones((1, *noise.shape))
@@ -207,8 +211,8 @@ class _Quadrature:
 
 def _equivalent_width(scale_m: float, quadrature: _Quadrature) -> float:
     """Return the width of the fits, in mean cells, that leave the noise of a Gaussian of `scale_m`."""
-    # Far from the cell's size both go with the sixth power, so one trial gives the factor.
-    trial = 16.0
+    # Both noises go with the sixth power, so one of the widths in use gives the factor.
+    trial = _WIDTHS[1]
     fit = quadrature.fit_response(trial, 1)
     response = 1 - (1 - fit) ** 2
     d = quadrature.derivatives()
@@ -271,6 +275,13 @@ def _thinned(
     return fit_smooth(level, quadrature.kernel(_THINNING), 2, 4), response, 2 * thinning
 
 
+def _rounding(z: FloatArray, flat: npt.NDArray[np.floating]) -> float:
+    """Return the noise of the numbers themselves, some units in their last place."""
+    original = np.finfo(np.float64).eps * max(abs(np.nanmax(z)), abs(np.nanmin(z)))
+    worked = np.finfo(flat.dtype).eps * max(abs(np.nanmax(flat)), abs(np.nanmin(flat)))
+    return 8 * float(max(original, worked))
+
+
 def _rim_distance(flat: npt.NDArray[np.floating], nodes: tuple[int, int]) -> FloatArray:
     """Return the distance of the nodes to the map's edge or the next hole, in cells."""
     rows, cols = (np.arange(n) * _STEP + 0.5 for n in nodes)
@@ -302,7 +313,11 @@ def _rim_rise(scale: _Scale, rim: FloatArray, table: FloatArray) -> FloatArray:
 
 
 def _weigh(
-    scales: Iterator[_Scale], noise_m: FloatArray, rim: FloatArray, quadrature: _Quadrature
+    scales: Iterator[_Scale],
+    noise_m: FloatArray,
+    rim: FloatArray,
+    quadrature: _Quadrature,
+    least_width: float,
 ) -> tuple[list[_Scale], npt.NDArray[np.float64]]:
     """Return the scales that matter and the share of each on the nodes, (scales, m, n), sum 1.
 
@@ -323,10 +338,13 @@ def _weigh(
         risk.append(bias + quadrature.hessian(coarser.response) * variance * rise)
         stack.append(coarser)
         least = np.minimum(least, risk[-1])
-        if (bias > _HOPELESS * least).all():
+        # Widths are half an octave apart: one within a quarter of an octave will do.
+        if coarser.width >= 0.84 * least_width and (bias > _HOPELESS * least).all():
             break
         finer = coarser
-    risks = np.array(risk)
+    too_fine = min(sum(s.width < 0.84 * least_width for s in stack), len(stack) - 1)
+    stack, risks = stack[too_fine:], np.array(risk[too_fine:])
+    least = risks.min(axis=0)
     # Where even the best is exact, all that are as exact share.
     ratio = np.where(risks > 0, least / np.where(risks > 0, risks, 1.0), 1.0)
     weights = ratio**4
@@ -543,10 +561,13 @@ def _mix(
                 if part == 0.0:
                     planes[:, i, j] = np.nan
                 continue
-            if fit or wide or not _three_points(z, i, j, dx, dy, d):
-                if not (wide and _five_points(z, i, j, dx, dy, d)):
-                    stencil(z, i, j, box)
-                    differentiate(box, dx, dy, fit and not wide, d)
+            # The whole window by its formula, else (an edge, a hole, the least-squares choice) the box.
+            whole = (wide and _five_points(z, i, j, dx, dy, d)) or (
+                not wide and not fit and _three_points(z, i, j, dx, dy, d)
+            )
+            if not whole:
+                stencil(z, i, j, box)
+                differentiate(box, dx, dy, fit and not wide, d)
             for k in range(5):
                 if part == 0.0:
                     planes[k, i, j] = d[k]

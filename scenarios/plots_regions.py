@@ -34,15 +34,17 @@ def draw_regions(axes: Any, grid: Grid, regions: RegionMap) -> None:
     step = max(1, -(-max(grid.shape) // _MOST_PIXELS))
     z = grid.elevation_m[::step, ::step]
     known = np.isfinite(z)
-    relief = np.nanpercentile(z, 98) - np.nanpercentile(z, 2)
+    relief = float(np.nanpercentile(z, 98) - np.nanpercentile(z, 2))
     # Exaggerated so that relief is a sixth of the map's width, whatever its true height.
     exaggeration = 0.15 * max(grid.shape) * grid.cell_m / max(relief, 1e-9)
-    shade = LightSource(315, 45).hillshade(
-        np.where(known, z, np.nanmedian(z)),
-        vert_exag=min(exaggeration, 1e4),
-        dx=grid.cell_m * step,
-        dy=grid.cell_north_m * step,
-    )
+    shade = np.ones(z.shape)
+    if min(z.shape) > 1:  # one row has no slope across itself to shade
+        shade = LightSource(315, 45).hillshade(
+            np.where(known, z, np.nanmedian(z)),
+            vert_exag=min(exaggeration, 1e4),
+            dx=grid.cell_m * step,
+            dy=grid.cell_north_m * step,
+        )
     image = class_image(regions)[::step, ::step] * (0.45 + 0.55 * shade[..., None])
     image[~known] = 1.0
     label = regions.region[::step, ::step]

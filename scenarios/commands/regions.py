@@ -56,8 +56,12 @@ def command(
     from dataclasses import asdict
     from time import perf_counter
 
+    import numpy as np
+
+    from mapping.object_layer import read_objects, write_lifted
     from mapping.rasters import read_map
     from mapping.region_files import write_segmentation
+    from perception.background import lift_objects
     from perception.records import InputError
     from perception.regions import RegionConfig, segment
     from scenarios.outputs import write_metrics
@@ -70,13 +74,22 @@ def command(
     grid = read_map(map_path, map_sigma_m)
     prepare_out(out)
     start = perf_counter()
+    objects = None if objects_path is None else read_objects(objects_path, grid)
+    surface, lifted = grid, None
+    if objects is not None:
+        lifted = lift_objects(grid, objects.easting_m, objects.northing_m, objects.radius_m)
+        surface = lifted.background
     with progress_bars(quiet) as progress:
-        result = segment(grid, config, progress)
+        result = segment(surface, config, progress)
         seconds = perf_counter() - start
         write_segmentation(out, result)
+        if objects is not None and lifted is not None:
+            write_lifted(out / "objects.gpkg", objects, lifted, result.regions)
         plot_regions(out / "regions.png", grid, result.regions, map_path.name)
         plot_legend(out / "legend.png")
     metrics = _metrics(result, seconds)
+    if lifted is not None:
+        metrics["objects_lifted"] = int(np.isfinite(lifted.height_m).sum())
     write_metrics(out, metrics, {**asdict(config), "map": str(map_path)})
     if not quiet:
         _print(result, metrics, out)

@@ -1,0 +1,114 @@
+"""`bathynav regions` from the door: files, table, refusals in one line."""
+
+import json
+
+import numpy as np
+import pytest
+import rasterio
+from click.testing import CliRunner
+from rasterio.transform import from_origin
+
+from mapping.rasters import write_map
+from perception.records import Grid, InputError
+from scenarios.commands.regions import command
+
+
+def write(path, z, sigma=None):
+    write_map(path, Grid(np.asarray(z, float), 500000.0, 7000000.0, 1.0, "EPSG:32602", sigma))
+    return path
+
+
+def run(*arguments):
+    return CliRunner().invoke(command, [str(a) for a in arguments], catch_exceptions=True)
+
+
+def hill(n=64):
+    y, x = np.mgrid[:n, :n] - n / 2
+    z = 5 * np.exp(-(x**2 + y**2) / 200) - 40
+    return z + np.random.default_rng(1).normal(0, 0.03, z.shape)
+
+
+def test_a_map_becomes_every_file_of_the_contract(tmp_path):
+    path = write(tmp_path / "map.tif", hill())
+    done = run(path, "--out", tmp_path / "out", "--levels", 2)
+    assert done.exit_code == 0, done.output
+    names = {p.name for p in (tmp_path / "out").iterdir()}
+    assert {
+        "regions.tif", "regions.gpkg", "regions.qml", "curvature.tif", "legend.png", "regions.png",
+        "metrics.json", "config.toml", "regions-level-2.tif",
+    } <= names  # fmt: skip
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["share_peak"] > 0
+    assert "peak" in done.output
+
+
+def test_quiet_prints_nothing(tmp_path):
+    path = write(tmp_path / "map.tif", hill(32))
+    assert run(path, "--out", tmp_path / "out", "-q").output == ""
+
+
+@pytest.mark.parametrize(
+    "z",
+    [np.full((1, 1), -3.0), np.full((1, 30), -3.0), np.full((40, 40), -3.0), hill(40) + 3e6],
+    ids=["one cell", "one row", "constant", "millions"],
+)
+@pytest.mark.parametrize("scale", [None, 1000.0], ids=["chosen", "wider than the map"])
+def test_odd_maps_give_a_clear_result(tmp_path, z, scale):
+    path = write(tmp_path / "map.tif", z)
+    more = () if scale is None else ("--scale", scale)
+    done = run(path, "--out", tmp_path / "out", *more)
+    assert done.exit_code == 0, (done.output, done.exception)
+    with rasterio.open(tmp_path / "out" / "regions.tif") as source:
+        assert (source.read(1) > 0).all()
+
+
+def test_an_odd_sigma_band_is_no_obstacle(tmp_path):
+    sigma = np.full((64, 64), 0.03)
+    sigma[:10] = 0
+    sigma[10:20] = -1
+    sigma[20:30] = np.nan
+    path = write(tmp_path / "map.tif", hill(), sigma)
+    assert run(path, "--out", tmp_path / "out").exit_code == 0
+
+
+def refused(*arguments):
+    done = run(*arguments)
+    assert isinstance(done.exception, InputError), done.exception
+    return str(done.exception)
+
+
+def test_a_map_of_nan_is_refused(tmp_path):
+    path = write(tmp_path / "map.tif", np.full((9, 9), np.nan))
+    assert "no height" in refused(path, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_degrees_are_refused_with_the_way_out(tmp_path):
+    path = tmp_path / "degrees.tif"
+    profile = dict(driver="GTiff", width=8, height=8, count=1, dtype="float32", crs="EPSG:4326")
+    with rasterio.open(path, "w", transform=from_origin(10, 50, 0.01, 0.01), **profile) as target:
+        target.write(np.zeros((8, 8), np.float32), 1)
+    assert "gdalwarp" in refused(path, "--out", tmp_path / "out")
+
+
+def test_impossible_options_and_missing_files_are_refused(tmp_path):
+    path = write(tmp_path / "map.tif", hill(32))
+    assert "scale" in refused(path, "--out", tmp_path / "out", "--scale", -2)
+    assert "no such file" in refused(tmp_path / "none.tif", "--out", tmp_path / "out")
+    missing = tmp_path / "objects.gpkg"
+    assert "objects.gpkg" in refused(path, "--out", tmp_path / "out", "--objects", missing)
+
+
+def test_objects_become_a_layer_of_their_own(tmp_path):
+    z = hill()
+    z[10:13, 50:53] += 3
+    path = write(tmp_path / "map.tif", z)
+    objects = tmp_path / "objects.csv"
+    objects.write_text("easting_m,northing_m,kind,height_m\n500051.5,6999988.5,hill,3\n")
+    done = run(path, "--out", tmp_path / "out", "--objects", objects)
+    assert done.exit_code == 0, (done.output, done.exception)
+    import pyogrio.raw
+
+    meta, _, _, values = pyogrio.raw.read(tmp_path / "out" / "objects.gpkg")
+    found = dict(zip(meta["fields"], values, strict=True))
+    assert found["height_over_floor_m"][0] == pytest.approx(3, abs=0.3)
