@@ -20,12 +20,14 @@ from scipy import ndimage
 from perception.first_return import first_return_lead
 from perception.gain_basis import GainBasis
 from perception.posterior import Problem, Spectrum, dual_features
+from perception.profiles import mean_profiles, one_sided
 from perception.rays import Look, Rays, Soundings, stack_rays, stack_soundings
 from perception.records import BoolArray, FloatArray, Grid, InputError, Progress, silent
 from perception.roughness import learn_roughness
 from perception.shading import Rows, trace
 from perception.soundings import (
     Equations,
+    both,
     join,
     sounding_equations,
 )
@@ -105,6 +107,7 @@ class _State:
     config: InversionConfig
     lead_m: FloatArray | float = 0.0
     lead_sigma_m: float = 0.0
+    base: FloatArray | None = None
     residual: list[float] = field(default_factory=list)
     step_m: list[float] = field(default_factory=list)
 
@@ -224,7 +227,8 @@ def _albedo_prior(config: InversionConfig) -> Spectrum:
 
 def _sounding_surface(state: _State) -> FloatArray:
     equations = sounding_equations(
-        state.surface, state.west_m, state.south_m, state.cell_m, state.soundings, below=True
+        state.surface, state.west_m, state.south_m, state.cell_m, state.soundings, below=True,
+        lead_m=state.lead_m, lead_sigma_m=state.lead_sigma_m,
     )
     problem = _problem(state, None, equations)
     fields = (state.surface, state.albedo, state.gain)
@@ -284,6 +288,7 @@ def _iterate(
             state.surface, state.west_m, state.south_m, state.cell_m, state.soundings,
             lead_m=state.lead_m, lead_sigma_m=state.lead_sigma_m,
         )
+        equations = both(equations, _held_profiles(state, rows))
         problem = _problem(state, data, equations)
         fields = (state.surface, state.albedo, state.gain)
         solution, used = problem.solve(fields, problem.right_side(), tolerance=1e-3, most=60)
@@ -300,6 +305,18 @@ def _iterate(
         if step < 0.02:
             break
     return problem, passed, rows
+
+
+def _held_profiles(state: _State, rows: Rows) -> Equations:
+    """Return the mean profiles that one-sided looks must not change."""
+    if state.base is None:
+        # Once the first returns' lead is known: the surface of the soundings alone.
+        state.base = _sounding_surface(state)
+    spread = float(np.std(state.soundings.up_m - state.soundings.range_m))
+    return mean_profiles(
+        state.base, state.west_m, state.south_m, state.cell_m, state.rays,
+        one_sided(rows, state.shape), max(0.1 * spread, 0.02),
+    )  # fmt: skip
 
 
 def _learn_lead(state: _State, rows: Rows, rng: np.random.Generator) -> None:

@@ -26,6 +26,15 @@ class Equations:
     value: FloatArray
 
 
+def both(first: Equations, second: Equations) -> Equations:
+    """Return two sets of equations as one."""
+    return Equations(
+        sparse.csr_matrix(sparse.vstack([first.matrix, second.matrix])),
+        np.concatenate([first.weight, second.weight]),
+        np.concatenate([first.value, second.value]),
+    )
+
+
 # The floor's nearest point is searched within this part of the range to either side: a slope of 35
 # degrees.
 _REACH = 0.7
@@ -60,7 +69,11 @@ def sounding_equations(
     matrix = bilinear_rows(
         (north - south_m) / cell_m, (east - west_m) / cell_m, factor, surface.shape
     )
-    return Equations(matrix, 1 / (bottom.sigma_m**2 + lead_sigma_m**2), bottom.range_m + lead_m - slant + factor * height)
+    return Equations(
+        matrix,
+        1 / (bottom.sigma_m**2 + lead_sigma_m**2),
+        bottom.range_m + lead_m - slant + factor * height,
+    )
 
 
 def nearest_points(

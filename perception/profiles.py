@@ -1,0 +1,78 @@
+"""Ground seen from one side only: there the mean profile stays what the soundings say.
+
+An unknown gain by angle and an unknown mean slope by angle explain the same echoes. Looks from the
+other side or across tell them apart; where there are none, echoes tell how the floor departs from its
+mean profile along the track, not the profile itself. Each pass, side and stretch of ground range
+therefore keeps its mean height, unless seen from elsewhere too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import sparse
+
+from perception.rays import Rays
+from perception.records import BoolArray, FloatArray
+from perception.shading import Rows
+from perception.soundings import Equations, bilinear_rows
+
+# Looks whose mean direction has at least this length come from one side (1 = all from one direction).
+_ONE_SIDED = 0.8
+_STRETCH_CELLS = 4
+
+
+def one_sided(rows: Rows, shape: tuple[int, int]) -> BoolArray:
+    """Return (rows - 1, cols - 1), True where all looks at a cell have about one direction."""
+    duals = (shape[0] - 1) * (shape[1] - 1)
+    length = np.maximum(np.hypot(rows.c_east, rows.c_north), 1e-9)
+    count = np.bincount(rows.cell, minlength=duals)
+    east = np.bincount(rows.cell, rows.c_east / length, minlength=duals)
+    north = np.bincount(rows.cell, rows.c_north / length, minlength=duals)
+    mean = np.hypot(east, north) / np.maximum(count, 1)
+    return ((count > 0) & (mean > _ONE_SIDED)).reshape(shape[0] - 1, shape[1] - 1)
+
+
+def mean_profiles(
+    base: FloatArray,
+    west_m: float,
+    south_m: float,
+    cell_m: float,
+    rays: Sequence[Rays],
+    single: BoolArray,
+    sigma_m: float,
+) -> Equations:
+    """Return equations that hold mean heights by pass, side and ground range to those of `base`.
+
+    Parameters
+    ----------
+    base : (rows, cols) surface of the soundings alone.
+    single : (rows - 1, cols - 1) where the ground is seen from one side only.
+    sigma_m : 1-sigma of a mean.
+    """
+    parts: list[sparse.csr_matrix] = []
+    stretch = _STRETCH_CELLS * cell_m
+    for ray in rays:
+        ground = np.arange(1, int(ray.reach_m / stretch)) * stretch
+        every = slice(None, None, 2)
+        east = ray.easting_m[every, None] + np.sin(ray.azimuth_rad)[every, None] * ground
+        north = ray.northing_m[every, None] + np.cos(ray.azimuth_rad)[every, None] * ground
+        col, row = (east - west_m) / cell_m, (north - south_m) / cell_m
+        inside = (col >= 0) & (row >= 0) & (col < single.shape[1]) & (row < single.shape[0])
+        c = np.where(inside, col, 0).astype(np.int64)
+        r = np.where(inside, row, 0).astype(np.int64)
+        inside &= single[r, c]
+        number = inside.sum(axis=0)
+        group = np.broadcast_to(np.arange(len(ground)), inside.shape)[inside]
+        if not len(group):
+            continue
+        points = bilinear_rows(row[inside], col[inside], 1.0 / number[group], base.shape)
+        gather = sparse.csr_matrix(
+            (np.ones(len(group)), (group, np.arange(len(group)))), shape=(len(ground), len(group))
+        )
+        parts.append(sparse.csr_matrix((gather @ points)[np.flatnonzero(number > 3)]))
+    if not parts:
+        return Equations(sparse.csr_matrix((0, base.size)), np.zeros(0), np.zeros(0))
+    matrix = sparse.csr_matrix(sparse.vstack(parts))
+    return Equations(matrix, np.full(matrix.shape[0], sigma_m**-2.0), matrix @ base.ravel())
