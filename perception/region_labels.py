@@ -133,20 +133,26 @@ def region_borders(
     length = np.zeros(1 << 16)
     used = 0
     for i in range(rows):
+        # Runs of one pair are added up first: most borders go on as they were a cell ago.
+        run_key, run_m = np.int64(-1), 0.0
         for j in range(cols):
             a = np.int64(region[i, j])
             if a == 0:
                 continue
-            if j + 1 < cols:
-                b = np.int64(region[i, j + 1])
-                if b != 0 and b != a:
-                    key = (min(a, b) << 32) | max(a, b)
-                    keys, length, used = _add_border(keys, length, used, key, cell_north_m)
-            if i + 1 < rows:
-                b = np.int64(region[i + 1, j])
-                if b != 0 and b != a:
-                    key = (min(a, b) << 32) | max(a, b)
-                    keys, length, used = _add_border(keys, length, used, key, cell_m)
+            b = np.int64(region[i, j + 1]) if j + 1 < cols else a
+            if b != a and b != 0:
+                key = (min(a, b) << 32) | max(a, b)
+                keys, length, used = _add_border(keys, length, used, key, cell_north_m)
+            b = np.int64(region[i + 1, j]) if i + 1 < rows else a
+            if b != a and b != 0:
+                key = (min(a, b) << 32) | max(a, b)
+                if key != run_key:
+                    if run_m > 0:
+                        keys, length, used = _add_border(keys, length, used, run_key, run_m)
+                    run_key, run_m = key, 0.0
+                run_m += cell_m
+        if run_m > 0:
+            keys, length, used = _add_border(keys, length, used, run_key, run_m)
     return _pairs(keys, length, used)
 
 

@@ -14,6 +14,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "sonar-files": ("sonar_files", "reading sonar files: pings a second, memory at 1x and 10x"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
     "planning": ("planning", "Routes: cost against the grid search, parts switched off, peers."),
+    "regions": ("regions", "H-K regions: signs under noise and seconds, beside fixed scales and peers"),
 }
 
 
