@@ -138,6 +138,11 @@ class Installation:
         mount = self.sonar
         poses = with_mounting(poses, mount.heading_deg, mount.pitch_deg, mount.roll_deg)
         if self.tide is not None:
+            if not np.isfinite(poses.depth_m).any():
+                raise InputError(
+                    f"{self.tide.source}: the survey has no depth that a tide could correct; give "
+                    "[sonar] depth_m in install.toml, or leave --tide out"
+                )
             poses = with_tide(poses, self.tide)
         if self.sound_speed_m_s is not None:
             poses = with_sound_speed(poses, np.full(len(poses.time_s), self.sound_speed_m_s))

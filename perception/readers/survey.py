@@ -334,6 +334,8 @@ def _sane_samples(samples: IntArray, defects: list[str]) -> IntArray:
 
 
 def _joined(tables: Sequence[PingTable]) -> PingTable:
+    if len(tables) == 1:
+        return tables[0]
     columns: dict[str, Any] = {
         f.name: np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(PingTable)
     }

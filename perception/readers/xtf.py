@@ -27,6 +27,7 @@ from perception.readers.xtf_attitude import attitude_at, positions_at
 from perception.readers.xtf_channels import (
     channel_frequency_hz,
     chosen_channels,
+    keep_channels,
     merge_split_pings,
     text_of,
 )
@@ -116,6 +117,7 @@ def scan(path: Path, progress: Progress) -> XtfFile:
 def _file_of(path: Path, index: XtfIndex) -> XtfFile:
     defects = list(index.defects)
     port_number, starboard_number = chosen_channels(path, index, defects)
+    index = keep_channels(index, (port_number, starboard_number))
     index = merge_split_pings(index, defects)
     columns = RawPings.empty(len(index.pings))
     records = {}

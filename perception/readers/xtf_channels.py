@@ -120,3 +120,16 @@ def merge_split_pings(index: XtfIndex, defects: list[str]) -> XtfIndex:
     )
     row_of = np.searchsorted(leaders, owner)
     return replace(index, pings=index.pings[leaders], channel_ping=row_of[index.channel_ping])
+
+
+def keep_channels(index: XtfIndex, numbers: tuple[int | None, int | None]) -> XtfIndex:
+    """Keep the packets that hold a chosen channel: others (sub-bottom, a second frequency) are no pings."""
+    chosen = np.isin(index.channel_records["ChannelNumber"], [n for n in numbers if n is not None])
+    pings = np.unique(index.channel_ping[chosen])
+    return replace(
+        index,
+        pings=index.pings[pings],
+        channel_records=index.channel_records[chosen],
+        channel_ping=np.searchsorted(pings, index.channel_ping[chosen]),
+        channel_data=index.channel_data[chosen],
+    )

@@ -277,3 +277,19 @@ def test_a_tide_needs_a_dated_clock(tmp_path):
     installation = read_installation(tide=tide)
     with pytest.raises(InputError, match="no date"):
         open_survey([make_xtf(tmp_path / "a.xtf", Plan(tweak=tweak))], installation=installation)
+
+
+def test_a_tide_needs_a_depth(tmp_path):
+    def tweak(i, ping, channels):
+        ping.SensorDepth = 0.0
+
+    tide = write(
+        tmp_path / "tide.csv",
+        "time,height_m\n2024-05-06T07:00:00Z,2.0\n2024-05-06T08:00:00Z,2.0\n",
+    )
+    sonar = make_xtf(tmp_path / "a.xtf", Plan(tweak=tweak))
+    with pytest.raises(InputError, match="no depth that a tide could correct"):
+        open_survey([sonar], installation=read_installation(tide=tide))
+    fixed = write(tmp_path / "i.toml", "[sonar]\ndepth_m = 0.5\n")
+    survey = open_survey([sonar], installation=read_installation(fixed, tide))
+    assert_allclose(survey.pings.depth_m, 0.5 - 2.0)

@@ -323,6 +323,25 @@ def test_two_channels_without_a_type_are_taken_for_port_and_starboard(tmp_path):
     assert_allclose(np.median(swath.starboard) / np.median(swath.port), 2.0, rtol=0.1)
 
 
+def test_packets_of_a_sub_bottom_profiler_are_no_pings(tmp_path):
+    plan = Plan(channel_types=(1, 2, 0))
+    header, *side_scan = xtf_packets(plan)
+    mixed = []
+    for packet in side_scan:
+        profile = bytearray(packet[:256] + packet[256 + 2 * 576 : 256 + 3 * 576])
+        profile[4:6] = (1).to_bytes(2, "little")
+        profile[10:14] = len(profile).to_bytes(4, "little")
+        sides = bytearray(packet[: 256 + 2 * 576])
+        sides[4:6] = (2).to_bytes(2, "little")
+        sides[10:14] = len(sides).to_bytes(4, "little")
+        mixed += [bytes(sides), bytes(profile)]
+    path = tmp_path / "a.xtf"
+    path.write_bytes(header + b"".join(mixed))
+    survey = open_survey([path])
+    assert survey.n_pings == 60 and survey.files[0].packets == {"sonar": 120}
+    assert survey.swath(0).ping.tolist() == list(range(60))
+
+
 def test_channels_that_all_call_themselves_0_count_by_their_place(tmp_path):
     def tweak(i, ping, channels):
         channels[1].ChannelNumber = 0
