@@ -22,18 +22,27 @@ def plot_overview(out: Path, path: Path) -> None:
     """Draw the mission in `out` (all stages done) into `path`."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 8.6), layout="constrained")
-    axes = figure.subplots(2, 3)
+    figure = Figure(figsize=(15, 9), layout="constrained")
+    axes: dict[str, Any] = figure.subplot_mosaic(
+        [
+            ["echoes", "truth", "map"],
+            ["regions", "position", "route"],
+            ["regions", "position", "profile"],
+        ],
+        height_ratios=(1.0, 0.72, 0.28),
+    )
     truth = read_map(out / "simulate" / "truth" / "elevation.tif")
     grid = read_map(out / "map" / "map.tif")
     limits = tuple(np.nanpercentile(grid.elevation_m, [1, 99]))
-    _echoes(axes[0, 0], out)
-    _relief(axes[0, 1], _cut(truth, grid), limits, "the true sea floor (kept from every estimate)")
-    _relief(axes[0, 2], grid, limits, "the map from echoes, track before and after")
-    _tracks(axes[0, 2], out / "map")
-    _regions(axes[1, 0], out / "regions", grid)
-    _position(axes[1, 1], out)
-    _route(axes[1, 2], out / "plan", grid, limits)
+    _echoes(axes["echoes"], out)
+    _relief(
+        axes["truth"], _cut(truth, grid), limits, "the true sea floor (kept from every estimate)"
+    )
+    _relief(axes["map"], grid, limits, "the map from echoes, track before and after")
+    _tracks(axes["map"], out / "map")
+    _regions(axes["regions"], out / "regions", grid)
+    _position(axes["position"], out)
+    _route(axes["route"], axes["profile"], out / "plan", grid, limits)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=90)
 
@@ -122,7 +131,14 @@ def _regions(axes: Any, folder: Path, grid: Grid) -> None:
         Patch(color=colour, label=name)
         for colour, name in zip(_CLASS_COLOURS[1:], REGION_CLASSES[1:], strict=True)
     ]
-    axes.legend(handles=handles, fontsize=7, ncols=4, loc="lower center", framealpha=0.9)
+    axes.legend(
+        handles=handles,
+        fontsize=7,
+        ncols=4,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.12),
+        frameon=False,
+    )
     axes.set(title="regions by mean and Gaussian curvature", xlabel="m", ylabel="m")
 
 
@@ -142,6 +158,7 @@ def _position(axes: Any, out: Path) -> None:
     axes.semilogy(minutes, error(found.easting_m, found.northing_m), label="with terrain fixes")
     axes.semilogy(minutes, _claimed(found), color="0.6", lw=1, label="claimed 1-sigma")
     axes.legend(fontsize=8)
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.set(
         title="position error of the run back over the ground",
         xlabel="minutes",
@@ -153,23 +170,19 @@ def _claimed(track: Trajectory) -> FloatArray:
     return np.hypot(track.sigma_easting_m, track.sigma_northing_m)
 
 
-def _route(axes: Any, folder: Path, grid: Grid, limits: tuple[float, ...]) -> None:
+def _route(axes: Any, profile: Any, folder: Path, grid: Grid, limits: tuple[float, ...]) -> None:
     _relief(axes, grid, limits, "a route near the bottom, proved clear")
     path = folder / "route.csv"
     if not path.exists():
-        axes.set_title("no route: see the report for the reason")
+        axes.set_title("no route: the report says why")
+        profile.set_axis_off()
         return
     route = np.genfromtxt(path, delimiter=",", names=True)
     e, n = route["easting_m"] - grid.west_m, route["northing_m"] - grid.south_m
     axes.plot(e, n, color="white", lw=2)
     axes.plot(e[[0, -1]], n[[0, -1]], "o", color="#ff5a3c", ms=5)
-    inset = axes.inset_axes((0.05, 0.04, 0.9, 0.24))
-    inset.plot(route["distance_m"], route["depth_m"], color="white", lw=1.2)
-    inset.fill_between(
-        route["distance_m"], route["depth_m"] + route["altitude_m"],
-        float(np.max(route["depth_m"] + route["altitude_m"])) + 1, color="#7a6a55",
-    )  # fmt: skip
-    inset.invert_yaxis()
-    inset.set_facecolor("#24405c")
-    inset.tick_params(labelsize=7, colors="white")
-    inset.set_ylabel("depth, m", fontsize=7, color="white")
+    floor = -(route["depth_m"] + route["altitude_m"])
+    profile.fill_between(route["distance_m"], floor, floor.min() - 1, color="#7a6a55")
+    profile.plot(route["distance_m"], -route["depth_m"], color="#14507a")
+    profile.set(xlabel="along the route, m", ylabel="elevation, m")
+    profile.margins(x=0)
