@@ -17,7 +17,7 @@ from scenarios.commands.console import (
 
 if TYPE_CHECKING:
     from perception.readers import RawFile, Survey
-    from perception.records import FloatArray, IntArray, Progress
+    from perception.records import FloatArray, IntArray
 
 
 @click.command()
@@ -27,46 +27,66 @@ if TYPE_CHECKING:
 def command(files: tuple[Path, ...], crs: str | None, quiet: bool, verbose: bool) -> int:
     """Tell what sonar files hold: pings, ranges, track, gaps, defects. Writes nothing.
 
-    Each file is told by itself. Exit 0 where every file could be told, 1 where one cannot be used.
+    Each file is told by itself, then several as the one survey that they make. Exit 0 where every
+    file could be told, 1 where one cannot be used.
     """
+    from perception.readers import scan_file
+
     set_verbosity(quiet, verbose)
     failures = []
+    good: list[RawFile] = []
     with progress_bars(quiet) as progress:
         for path in files:
             try:
-                title, rows = describe(path, crs, progress)
+                raw = scan_file(path, progress)
+                rows = describe(raw, crs)
             except BathynavError as error:
                 if len(files) == 1:
                     raise
                 failures.append(error)
                 click.echo(f"bathynav: {' '.join(str(error).split())}", err=True)
                 continue
+            if len(raw.pings):
+                good.append(raw)
             if not quiet:
-                print_table(title, rows)
+                print_table(str(path), rows)
+    if len(good) > 1 and not quiet:
+        print_table(f"survey of {len(good)} files", describe_survey(good, crs))
     return 1 if failures else 0
 
 
-def describe(path: Path, crs: str | None, progress: Progress) -> tuple[str, list[tuple[str, str]]]:
-    """Return a title and (name, value) rows for one file.
+def describe_survey(files: list[RawFile], crs: str | None) -> list[tuple[str, str]]:
+    """Return (name, value) rows for several files read as one survey, in the order given."""
+    from perception.readers import Survey
+
+    try:
+        survey = Survey.of(files, crs)
+    except BathynavError as error:
+        # Files told side by side need not belong together: that is news, not a failure.
+        return [("survey", f"these files do not make one: {error}")]
+    return _pings(survey) + _track(survey)
+
+
+def describe(raw: RawFile, crs: str | None) -> list[tuple[str, str]]:
+    """Return (name, value) rows for one file.
 
     A sound file of a kind that need not hold side-scan is told too; one that should and does not
     raises `InputError`.
     """
-    from perception.readers import Survey, scan_file
+    from perception.readers import Survey
 
-    raw = scan_file(path, progress)
     rows = [("format", raw.format), ("sonar", raw.sonar or "not named")]
     rows.append(("records", _counts(raw)))
     if len(raw.pings) == 0:
         rows += [("note", note) for note in raw.notes]
         rows.append(("side-scan", "none: this file cannot be mapped"))
         rows += [("defect", text) for text in raw.defects]
-        return str(path), rows
+        return rows
     survey = Survey.of([raw], crs)
     rows += _pings(survey) + _image(raw, survey) + _track(survey) + _vertical(survey)
     rows += [("note", note) for note in raw.notes]
     rows += [("defect", text) for text in (*survey.defects, *_altitude_defect(survey))]
-    return str(path), rows
+    return rows
 
 
 def _counts(raw: RawFile) -> str:

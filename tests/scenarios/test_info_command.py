@@ -128,6 +128,15 @@ def test_a_mix_of_good_and_bad_is_told_file_by_file(tmp_path, bathynav):
     assert len(err.strip().splitlines()) == 2
 
 
+def test_several_files_are_also_told_as_one_survey(tmp_path, bathynav):
+    later = Plan(n=30, start=Plan().start.replace(hour=9))
+    paths = make_xtf(tmp_path / "a.xtf"), make_xtf(tmp_path / "b.xtf", later)
+    status, out, _ = bathynav("info", *paths)
+    assert status == 0
+    survey = out.split("survey of 2 files")[1]
+    assert "90, 90 usable, 90 in passes" in survey and "pings 60 to 89" in survey
+
+
 def test_info_without_a_file_is_wrong_usage(bathynav):
     assert bathynav("info")[0] == 2
 
