@@ -416,7 +416,8 @@ def _below_objects(track: BottomTrack, sides: list[FloatArray], sample_m: float)
     if not dip.any():
         return track
     m = sides[0].shape[1]
-    image = np.nanmean(np.stack(sides), axis=0) if len(sides) > 1 else sides[0]
+    # Past a ping's last sample there is nothing: dark, like the water.
+    image = np.mean([np.where(np.isfinite(side), side, np.nanmin(side)) for side in sides], axis=0)
     usual = float(np.median(_edge_step(image, samples, np.flatnonzero(~dip), m)))
     rows = np.flatnonzero(dip)
     through = _edge_step(image, closed, rows, m) > 0.4 * usual
@@ -439,9 +440,7 @@ def _edge_step(image: FloatArray, track: FloatArray, rows: np.ndarray, m: int) -
     at = track[rows].astype(int)[:, None]
     before = np.clip(at + np.arange(-7, -1), 0, m - 1)
     after = np.clip(at + np.arange(1, 7), 0, m - 1)
-    step: FloatArray = np.nanmean(image[rows[:, None], after], axis=1) - np.nanmean(
-        image[rows[:, None], before], axis=1
-    )
+    step: FloatArray = (image[rows[:, None], after] - image[rows[:, None], before]).mean(axis=1)
     return step
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solveh_banded
+from scipy.ndimage import gaussian_filter1d
 
 from perception.records import FloatArray
 
@@ -133,17 +134,29 @@ def floor_beside(
     """
     offsets, weights, unit_variance = _line_kriging(roughness.power)
     n = len(along_m)
-    floor = np.empty((n, len(distance_m)))
-    sigma = np.empty_like(floor)
-    own = np.square(sigma_m)
-    for j, distance in enumerate(distance_m):
+    if n == 0 or len(distance_m) == 0:
+        return np.empty((n, len(distance_m))), np.empty((n, len(distance_m)))
+    step = max((along_m[-1] - along_m[0]) / max(n - 1, 1), 1e-6)
+    even = np.arange(n) * step + along_m[0]
+    line = np.interp(even, along_m, height_m)
+    # A weight at a distance stands for a stretch of the line and not for one line of it: the line is
+    # smoothed to the spacing of the weights. Few distances are worked out; between them all is smooth.
+    worked = np.unique(
+        np.concatenate([[0.0], np.geomspace(0.5 * step, distance_m.max() + step, 28)])
+    )
+    kept = np.empty((n, len(worked)))
+    for j, distance in enumerate(worked):
+        calm = gaussian_filter1d(
+            line, max(0.25 * distance / step, 0.01), mode="nearest", truncate=3.0
+        )
         at = along_m[:, None] + offsets * distance
         # Beyond the ends the line holds its last height.
-        values = np.interp(at, along_m, height_m)
-        floor[:, j] = values @ weights
-        variance = roughness.scale * distance**roughness.power * unit_variance
-        sigma[:, j] = np.sqrt(own + variance)
-    return floor, sigma
+        kept[:, j] = np.interp(at, even, calm) @ weights
+    high = np.clip(np.searchsorted(worked, distance_m), 1, len(worked) - 1)
+    part = (distance_m - worked[high - 1]) / (worked[high] - worked[high - 1])
+    floor = kept[:, high - 1] * (1 - part) + kept[:, high] * part
+    variance = roughness.scale * np.power(distance_m, roughness.power) * unit_variance
+    return floor, np.sqrt(np.square(sigma_m)[:, None] + variance)
 
 
 def _line_kriging(power: float) -> tuple[FloatArray, FloatArray, float]:

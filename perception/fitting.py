@@ -61,8 +61,8 @@ _SHAPE_BOUNDS = (float(np.log(0.8)), float(np.log(8.0)))
 # The floor's angular law is near Lambert's square, but recorders and sediments differ.
 _LAW_MEAN, _LAW_SIGMA = float(np.log(1.9)), 0.18
 _FACETS_PER_BIN = 1.5
-# Rounds of climbing from every start, and from the best two of each kind afterwards.
-_FIRST_ROUNDS, _LAST_ROUNDS = 6, 16
+# Rounds of climbing from every start, and from the best of each kind afterwards.
+_FIRST_ROUNDS, _LAST_ROUNDS = 5, 14
 
 
 def fit_patch(
@@ -94,7 +94,7 @@ def fit_patch(
     for sign in (1.0, -1.0):
         mine = sorted((f for f in first if f is not None and f.sign == sign), key=lambda f: -f.gain)
         # A kind that is far behind after the first rounds will not catch up.
-        for fit in mine[:2]:
+        for fit in mine[:1]:
             if fit.gain > 0.6 * best:
                 last.append(
                     _climb(patch, sign, fit.corner, fit.parameters, flat_value, _LAST_ROUNDS)
@@ -174,7 +174,7 @@ def _climb(
             at, damping = trial, max(damping * 0.3, 1e-4)
             value, gradient, information = fisher_step(at, sign, corner, patch.ratio, *fixed)
             prior_value, prior_gradient, prior_information = trial_prior
-            if rise < 0.02:
+            if rise < 0.05:
                 break
         else:
             damping *= 6

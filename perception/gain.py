@@ -48,11 +48,13 @@ class Equalised:
         column and where there is no data.
     log_nominal : (n, m) float32 natural log of the nominal mean power.
     looks : effective number of looks of the speckle, from the spread of nominal samples.
+    expansion : power to which the recorder's levels were raised, 1 for a linear recorder (`expansion`).
     """
 
     ratio: FloatArray
     log_nominal: FloatArray
     looks: float
+    expansion: float = 1.0
 
 
 # Medians come from at most this many samples a side: 1e5 hold a bin's median to 1 % at one look.
@@ -95,12 +97,49 @@ def equalise(
     residual = log_power - log_nominal
     log_nominal += _slow_remainder(residual, floor, config)
     residual = np.where(floor, log_power - log_nominal, np.nan)
+    power_law = expansion(log_power, np.asarray(first_sample, float), effective_looks(residual))
+    residual *= np.float32(power_law)
     looks = effective_looks(residual)
     # The medians above are of log power; the nominal is the mean of power.
     median_of_mean = float(gammaincinv(looks, 0.5)) / looks
-    log_nominal -= np.float32(np.log(median_of_mean))
-    ratio = np.where(floor, power / np.exp(log_nominal), np.nan).astype(np.float32)
-    return Equalised(ratio, log_nominal.astype(np.float32), looks)
+    ratio = (np.exp(residual) * np.float32(median_of_mean)).astype(np.float32)
+    log_nominal -= np.float32(np.log(median_of_mean) / power_law)
+    return Equalised(ratio, log_nominal.astype(np.float32), looks, power_law)
+
+
+# Water below a linear recorder's floor by this much at least; one look of speckle spreads log power by 1.28.
+_LINEAR_CONTRAST = 18 * float(np.log(10)) / 10
+_ONE_LOOK_SPREAD = 1.28
+_MOST_EXPANSION = 5.0
+
+
+def expansion(log_power: FloatArray, first_sample: FloatArray, looks: float) -> float:
+    """Return the power that undoes a recorder's compression of levels, at least 1.
+
+    Recorders for display store something like the logarithm of the echo in 8 bits: water column and
+    shadow then lie a few decibels below the floor and not twenty. Raising the levels to a power brings
+    the water to 18 dB below the near floor, but never so far that the floor's speckle would spread
+    more than one look's; a linear recorder, whose one-look speckle already does, is left as it is.
+
+    Parameters
+    ----------
+    log_power : (n, m) natural log of recorded power.
+    first_sample : (n,) sample of the first return.
+    looks : effective looks of the recorded levels.
+    """
+    m = log_power.shape[1]
+    place = np.arange(m) / np.maximum(first_sample, 1.0)[:, None]
+    # Between the transmit pulse and the floor; from a little behind the edge to half as far again.
+    water = log_power[(place > 0.4) & (place < 0.9)]
+    near = log_power[(place > 1.1) & (place < 1.5)]
+    if len(water) < 100 or len(near) < 100:
+        return 1.0
+    contrast = float(np.median(near) - np.median(water))
+    spread = float(np.sqrt(polygamma(1, looks)))
+    if contrast <= 0:
+        return 1.0
+    wanted = min(_LINEAR_CONTRAST / contrast, _ONE_LOOK_SPREAD / spread)
+    return float(np.clip(wanted, 1.0, _MOST_EXPANSION))
 
 
 def incidence_coordinate(range_m: FloatArray, altitude_m: FloatArray) -> FloatArray:
@@ -126,12 +165,6 @@ def effective_looks(log_residual: FloatArray) -> float:
     grid = np.geomspace(0.3, 200, 80)
     width = np.log(gammaincinv(grid, 0.75)) - np.log(gammaincinv(grid, 0.25))
     return float(np.interp(-(high - low), -width, grid))
-
-
-def looks_of_variance(variance: float) -> float:
-    """Return L with ``trigamma(L) = variance``: the looks of log power with that variance."""
-    grid = np.geomspace(0.3, 200, 200)
-    return float(np.interp(-variance, -polygamma(1, grid), grid))
 
 
 def _log_power(power: FloatArray, floor: FloatArray) -> FloatArray:

@@ -37,6 +37,9 @@ class ObjectConfig:
         samples altogether.
     min_gain : least log likelihood over a flat floor of an object, natural log units.
     shape_sigma : what the family of shapes leaves open, as a part of the height.
+    fits, fits_per_ping : at most ``fits + fits_per_ping * pings`` shadows a side, the largest, are fitted;
+        on a floor strewn with shadows the rest are measured by the plain relation, which is quick, and
+        those below `plain_cells` samples are left out.
     """
 
     min_samples: int = 6
@@ -44,6 +47,9 @@ class ObjectConfig:
     min_cells: int = 20
     min_gain: float = 30.0
     shape_sigma: float = 0.04
+    fits: int = 30
+    fits_per_ping: float = 0.025
+    plain_cells: int = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +188,16 @@ def find_objects(
     """
     config = config or ObjectConfig()
     marks, shadows = _shadows(levels.label, config)
+    budget = config.fits + int(config.fits_per_ping * len(ratio))
+    least = sorted((shadow.cells for shadow in shadows), reverse=True)[:budget][-1:]
     rows = []
     for shadow in shadows:
-        row = _measure(shadow, marks, ratio, levels, sample_m, side, track, floor_sigma_m, config)
+        fitted = shadow.cells >= least[0]
+        if not fitted and shadow.cells < config.plain_cells:
+            continue
+        row = _measure(
+            shadow, fitted, marks, ratio, levels, sample_m, side, track, floor_sigma_m, config
+        )
         if row is not None:
             rows.append(_placed(row, side, track, pass_index))
     return rows
@@ -216,6 +229,7 @@ def _shadows(label: IntArray, config: ObjectConfig) -> tuple[IntArray, list[_Sha
 
 def _measure(
     shadow: _Shadow,
+    fitted: bool,
     marks: IntArray,
     ratio: FloatArray,
     levels: Levels,
@@ -226,29 +240,29 @@ def _measure(
     config: ObjectConfig,
 ) -> ObjectRow | None:
     """Return height, kind and footprint of one shadow's object, not yet placed on the map."""
-    patch = _patch(shadow, marks, ratio, levels, sample_m, track)
     peak = _peak_row(shadow)
     row = shadow.row0 + peak
     drop = float(track.altitude_m[row])
     start_m, end_m = shadow.start[peak] * sample_m, shadow.end[peak] * sample_m
     if not start_m > drop * 1.0001:
         return None
-    order = _order_evidence(shadow, ratio, levels.looks * levels.independent)
-    starts = _starts(shadow, start_m, end_m, drop, track)
-    if abs(order) > _SURE_ORDER:
-        starts = [start for start in starts if start[0] * order > 0]
-    fit = fit_patch(patch, starts, favour=_ORDER_WEIGHT * order)
-    if fit is not None and fit.gain < config.min_gain:
-        return None
-    floor_sigma = (
-        0.0
-        if floor_sigma_m is None
-        else float(floor_sigma_m[min(shadow.end[peak], len(floor_sigma_m)) - 1])
-    )
+    floor_sigma = 0.0
+    if floor_sigma_m is not None:
+        floor_sigma = float(floor_sigma_m[min(shadow.end[peak], len(floor_sigma_m)) - 1])
     drop_sigma = float(np.hypot(track.altitude_sigma_m[row], floor_sigma))
+    order = _order_evidence(shadow, ratio, levels.looks * levels.independent)
+    fit = None
+    if fitted:
+        starts = _starts(shadow, start_m, end_m, drop, track)
+        if abs(order) > _SURE_ORDER:
+            starts = [start for start in starts if start[0] * order > 0]
+        patch = _patch(shadow, marks, ratio, levels, sample_m, track)
+        fit = fit_patch(patch, starts, favour=_ORDER_WEIGHT * order)
+        if fit is not None and fit.gain < config.min_gain:
+            return None
     if fit is not None and _explains(fit, shadow, drop, track):
         return _of_fit(fit, start_m, end_m, drop, drop_sigma, config)
-    return _of_shadow(shadow, ratio, levels, sample_m, start_m, end_m, drop, drop_sigma, track)
+    return _of_shadow(shadow, order > 0, sample_m, start_m, end_m, drop, drop_sigma, track)
 
 
 def _order_evidence(shadow: _Shadow, ratio: FloatArray, looks: float) -> float:
@@ -427,27 +441,15 @@ def _of_fit(
 
 def _of_shadow(
     shadow: _Shadow,
-    ratio: FloatArray,
-    levels: Levels,
+    hill: bool,
     sample_m: float,
     start_m: float,
     end_m: float,
     drop: float,
     drop_sigma: float,
     track: Track,
-) -> ObjectRow | None:
+) -> ObjectRow:
     """Measure by the paper's relation: order of levels for the kind, the longest shadow for the height."""
-    before, after = [], []
-    for i in np.flatnonzero(shadow.start >= 0):
-        line = ratio[shadow.row0 + i]
-        reach = max(4, shadow.lengths[i] // 2)
-        before.append(line[max(0, shadow.start[i] - reach) : shadow.start[i]])
-        after.append(line[shadow.end[i] : shadow.end[i] + reach])
-    bright = [
-        float(np.nanmean(np.concatenate(v))) if v and np.isfinite(np.concatenate(v)).any() else 1.0
-        for v in (before, after)
-    ]
-    hill = bright[0] >= bright[1]
     length = end_m - start_m
     height = float((hill_height if hill else crater_depth)(length, start_m, drop))
     sigma = float(hill_sigma(length, start_m, drop, sample_m, drop_sigma))

@@ -82,3 +82,19 @@ def test_a_side_without_echo_is_all_no_data() -> None:
     nothing = np.full((20, 50), np.nan, np.float32)
     result = equalise(nothing, 0.1, np.ones(20), np.ones(20), np.zeros(20))
     assert np.isnan(result.ratio).all()
+
+
+def test_a_recorder_that_compresses_levels_is_expanded_and_a_linear_one_is_not() -> None:
+    survey = replace(SURVEY, noise=0.001)
+    swath = make_swath(box(1.5, 15, 25, 1.5, 3), survey, np.random.default_rng(8))
+    altitude = np.full(survey.n_pings, survey.altitude_m)
+    power = swath.starboard.astype(np.float64) ** 2
+    ratios = {}
+    for name, values in (("linear", power), ("compressed", power**0.3)):
+        result = equalise(values, survey.sample_m, altitude, altitude, np.zeros(survey.n_pings))
+        ratios[name] = result
+    assert ratios["linear"].expansion == pytest.approx(1.0, abs=0.1)
+    # 36 dB of water below floor became 11, and is brought back to 18.
+    assert ratios["compressed"].expansion > 1.5
+    shadow = np.s_[92:108, int(19.2 / 0.06) : int(21.0 / 0.06)]
+    assert ratios["compressed"].ratio[shadow].mean() < 0.25
