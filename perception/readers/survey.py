@@ -12,7 +12,6 @@ from perception.geodesy import (
     GEOGRAPHIC,
     LOCAL_CRS,
     convergence,
-    is_local,
     metric_crs,
     transform,
     utm_crs,
@@ -375,6 +374,3 @@ def _split(table: PingTable, files: Sequence[RawFile], config: PassConfig) -> tu
     flags[rows[split.turning]] |= int(PingFlag.TURNING)
     flags[rows[split.stopped]] |= int(PingFlag.STOPPED)
     return replace(table, pass_index=pass_index, flags=flags), int(pass_index.max(initial=-1)) + 1
-
-
-__all__ = ["PingTable", "Survey", "is_local"]
