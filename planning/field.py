@@ -159,7 +159,7 @@ def _near_bars(barred, reach):  # type: ignore[no-untyped-def]
     return near
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _search(stack, barred, width, height, moves, passed, first, source, target):  # type: ignore[no-untyped-def]
     rows, cols = barred.shape
     reach = 0

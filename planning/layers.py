@@ -159,7 +159,7 @@ def cost_to_go(thin: Thin, goal: tuple[int, int]) -> FloatArray:
 _SOFT_PRICE = 100.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _search_levels(  # type: ignore[no-untyped-def]
     lower,
     bottom,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -174,21 +175,16 @@ def _plan_on(
     nodes = field_.path(*node_b)
     guide = np.column_stack([nodes[:, 1] * surface.cell_m[0], nodes[:, 0] * surface.cell_m[1]])
     guide = np.concatenate([ends[:1], guide[1:-1], ends[1:]])
-    candidates = [_polished(surface, guide, "grid")]
-    lap("polish_s")
-    if config.layers and not _good_enough(candidates, grid_cost):
-        layered = layered_path(surface, tuple(ends[0]), tuple(ends[1]))
-        lap("layers_s")
-        if len(layered.points) > 2:
-            candidates.append(_polished(surface, layered.points, "layers"))
-        lap("polish_s")
+    candidates = _from_guides(surface, guide, ends, config)
+    lap("guides_s")
     if config.planner != "none":
-        seed = min(candidates, key=_merit)
-        found = _ompl(surface, seed, ends, config)
-        lap("ompl_s")
+        found = _ompl(surface, min(candidates, key=_merit), ends, config)
         if found is not None:
             candidates.append(_polished(surface, found, "ompl"))
-        lap("polish_s")
+        lap("ompl_s")
+    best = min(candidates, key=_merit)
+    candidates.append(polish(surface, best.points, _SWEEPS, rounds=2, source="final"))
+    lap("polish_s")
     route, problem = _best_proved(surface, candidates, grid.crs)
     if route is None:
         candidates += _second_tries(surface, candidates, ends)
@@ -205,12 +201,29 @@ def _plan_on(
     )  # fmt: skip
 
 
-# A route within this share of the limit-free grid search leaves the second guide nothing to find.
-_GOOD = 1.004
+# Sweeps of the polish: a first look at every guide with samples two cells apart, then the best in full.
+_FIRST_SWEEPS, _FIRST_STEP_CELLS, _SWEEPS = 25, 2.0, 40
 
 
-def _good_enough(candidates: list[Candidate], grid_cost: float) -> bool:
-    return any(c.breach == 0 and c.cost < _GOOD * grid_cost for c in candidates)
+def _from_guides(
+    surface: Surface, guide: FloatArray, ends: FloatArray, config: PlanConfig
+) -> list[Candidate]:
+    """Return the polished guides: the grid's, and that which knows pitch and ceiling.
+
+    They are made side by side: the kernels let go of the interpreter, and neither waits for the other.
+    """
+    if not config.layers:
+        return [_polished(surface, guide, "grid")]
+
+    def second() -> Candidate | None:
+        layered = layered_path(surface, tuple(ends[0]), tuple(ends[1]))
+        return _polished(surface, layered.points, "layers") if len(layered.points) > 2 else None
+
+    with ThreadPoolExecutor(2) as pool:
+        other = pool.submit(second)
+        first = _polished(surface, guide, "grid")
+        found = other.result()
+    return [first] if found is None else [first, found]
 
 
 def _merit(candidate: Candidate) -> tuple[bool, float]:
@@ -219,7 +232,13 @@ def _merit(candidate: Candidate) -> tuple[bool, float]:
 
 def _polished(surface: Surface, guide: FloatArray, source: str) -> Candidate:
     length = float(np.hypot(*np.diff(guide, axis=0).T).sum())
-    return polish(surface, smooth_guide(guide, control_spacing(surface, length)), source=source)
+    return polish(
+        surface,
+        smooth_guide(guide, control_spacing(surface, length)),
+        _FIRST_SWEEPS,
+        source=source,
+        step_cells=_FIRST_STEP_CELLS,
+    )
 
 
 def _ompl(

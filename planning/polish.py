@@ -23,6 +23,8 @@ _OVERLAP_PRICE = 300.0
 # From round to round the price of breaking the ceiling rises by the inverse of this: at first a path may
 # cut through what a harder price would fence off, and settles into the better valley.
 _EASE = 0.25
+# Least shift that is tried, in samples: a twentieth of a cell changes no cost that matters.
+_FINEST = 0.05
 # Pitch and radius are planned a little inside the limits: printed digits must keep them too.
 PITCH_RESERVE = 0.995
 RADIUS_RESERVE = 1.01
@@ -120,6 +122,7 @@ def polish(
     source: str = "",
     reserve_m: float = HEIGHT_RESERVE_M,
     fineness: float = 1.0,
+    step_cells: float = 1.0,
 ) -> Candidate:
     """Lower the cost of a control polygon until it stops falling; ends stay.
 
@@ -129,10 +132,11 @@ def polish(
     sweeps : most passes over all bumps in a round.
     rounds : after each but the last the control points are spaced evenly again.
     reserve_m : height kept in reserve at floor and ceiling.
-    fineness : samples per cell, and control points per usual control point.
+    fineness : samples per usual sample, and control points per usual control point.
+    step_cells : usual distance of samples, in cells; 2 for a first look at half the price.
     """
     spacing = control_spacing(surface, float(np.hypot(*np.diff(points, axis=0).T).sum())) / fineness
-    step = min(surface.cell_m) / fineness
+    step = step_cells * min(surface.cell_m) / fineness
     rules = rules_of(surface, reserve_m)
     points, locked = _lock_ends(surface, points.copy())
     best = evaluate(surface, points.copy(), source, step, rules)
@@ -183,7 +187,7 @@ def _scratch(points: FloatArray, step: float) -> tuple[FloatArray, ...]:
     return np.empty(n), np.empty(n), work, hull
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _whole_cost(stack, width, height, points, radius, step, rules, px, py, work, hull):  # type: ignore[no-untyped-def]
     n, overlap = sample_curve(points, 0, len(points) - 1, radius, step, px, py)
     if n < 0:
@@ -203,7 +207,7 @@ def _window_cost(  # type: ignore[no-untyped-def]
     return cost + _OVERLAP_PRICE * overlap
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _descend(  # type: ignore[no-untyped-def]
     stack,
     width,
@@ -228,7 +232,7 @@ def _descend(  # type: ignore[no-untyped-def]
     spacing = max(spacing, step)
     beyond = math.ceil(margin / spacing) + 2
     widths = np.array([16, 8, 4, 2, 1])
-    finest = 0.02 * step
+    finest = _FINEST * step
     delta = np.empty((len(widths), n))
     for level in range(len(widths)):
         delta[level, :] = min(0.25 * spacing * widths[level], 8.0 * spacing)
