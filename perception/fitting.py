@@ -180,7 +180,13 @@ def _climb(
             damping *= 6
             if damping > 1e4:
                 break
-    covariance = np.linalg.pinv(information + prior_information)
+    covariance = _inverse(information + prior_information)
     if not np.all(np.isfinite(covariance)) or not np.all(np.isfinite(at)):
         return None
     return BumpFit(at, covariance, sign, corner, float(value + prior_value - flat_value))
+
+
+def _inverse(information: FloatArray) -> FloatArray:
+    """Return the inverse of an information matrix; unseen directions come out very wide."""
+    inverse: FloatArray = np.linalg.inv(information + 1e-6 * np.eye(len(information)))
+    return inverse

@@ -92,7 +92,7 @@ def _trace(  # type: ignore[no-untyped-def]
     row, x_low, x_high, dy, x0, sx, height, beta, corner, kappa, drop, start_m, step_m, facet_m
 ):
     """Sum the lit facets of one line into `row`; return the ground range where the flat floor is lit again."""
-    count = min(max(int((x_high - x_low) / facet_m) + 1, 16), 600)
+    count = min(max(int((x_high - x_low) / facet_m) + 1, 16), 140)
     dx = (x_high - x_low) / count
     x_before, z_before = x_low, _height(x_low, dy, x0, sx, height, beta, corner)
     r_before = (x_before * x_before + (drop - z_before) ** 2) ** 0.5
@@ -184,6 +184,10 @@ def fisher_step(  # type: ignore[no-untyped-def]
     predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, base)
     slopes = np.empty((N_PARAMETERS, n, m))
     moved = parameters.copy()
+    level = np.empty((n, m))
+    for i in range(n):
+        for k in range(m):
+            level[i, k] = max(_soft(base[i, k], cap), LEAST_MEAN)
     for p in range(N_PARAMETERS):
         # Half a facet of position, or 2 % of a logarithm: smooth over the facets' own steps.
         h = 0.5 * facet_m if p < 2 else 0.02
@@ -192,10 +196,12 @@ def fisher_step(  # type: ignore[no-untyped-def]
         moved[p] = parameters[p]
         for i in range(n):
             for k in range(m):
-                slopes[p, i, k] = (
-                    max(_soft(slopes[p, i, k], cap), LEAST_MEAN)
-                    - max(_soft(base[i, k], cap), LEAST_MEAN)
-                ) / h
+                if slopes[p, i, k] == base[i, k]:
+                    slopes[p, i, k] = 0.0
+                else:
+                    slopes[p, i, k] = (
+                        max(_soft(slopes[p, i, k], cap), LEAST_MEAN) - level[i, k]
+                    ) / h
     value = 0.0
     gradient = np.zeros(N_PARAMETERS)
     information = np.zeros((N_PARAMETERS, N_PARAMETERS))
@@ -204,7 +210,7 @@ def fisher_step(  # type: ignore[no-untyped-def]
             e = ratio[i, k]
             if np.isnan(e):
                 continue
-            mu = max(_soft(base[i, k], cap), LEAST_MEAN)
+            mu = level[i, k]
             # A datum above the cap is censored: it says "more than the cap" and no more.
             if e < cap:
                 value -= weight * (e / mu + np.log(mu))
