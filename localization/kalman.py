@@ -120,6 +120,10 @@ class TerrainKalman:
         self.filter.P[:5, :5] = covariance
         self.filter.P[5:, 5:] = hypothesis.shared_m**2 * np.eye(self.beams)
 
+    def take(self, x: FloatArray, p: FloatArray) -> None:
+        """Take another state and covariance, all components."""
+        self.filter.x, self.filter.P = x.copy(), p.copy()
+
     @property
     def mean(self) -> FloatArray:
         """Mean (5,) of east, north, turn, scale and depth bias."""
@@ -221,7 +225,7 @@ class KalmanBank:
         self.tide_m2_s = tide_m_sqrt_h**2 / 3600.0
         self.beams = beams
         self.filters: list[TerrainKalman] = []
-        self.log_weight = np.zeros(0)
+        self.log_weight: FloatArray = np.zeros(0)
 
     def start(self, mean: FloatArray, covariance: FloatArray) -> None:
         """Begin tracking from a Gaussian of (east, north, turn, scale, depth bias)."""

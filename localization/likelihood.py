@@ -64,8 +64,8 @@ def sounding_noise(
     tilt = soundings.down**2 + 0.5 * slope**2 * (1 - soundings.down**2)
     range_m2 = soundings.range_sigma_m**2 * tilt
     length = error.length_m if np.isfinite(error.length_m) else DEFAULT_LENGTH_M
-    shared = sum(
-        variance * _sharing(soundings, reach, step_m)
+    shared: float = sum(
+        variance * _sharing(soundings.east_m, soundings.north_m, reach, step_m)
         for variance, reach in (
             (error.filtered_m**2, error.filtered_length_m),
             (error.correlated_m**2, length),
@@ -80,14 +80,16 @@ def sounding_noise(
     )
 
 
-def _sharing(soundings: Soundings, length_m: float, step_m: float) -> float:
+@numba.njit(cache=True)
+def _sharing(east_m, north_m, length_m, step_m):  # type: ignore[no-untyped-def]
     """Return how many soundings share one error of correlation length `length_m`."""
+    across = 0.0
+    for i in range(east_m.size):
+        for j in range(east_m.size):
+            apart = np.hypot(east_m[i] - east_m[j], north_m[i] - north_m[j])
+            across += np.exp(-apart / length_m)
     along = 1.0 + 2.0 * length_m / max(step_m, 1e-3)
-    apart = np.hypot(
-        soundings.east_m[:, None] - soundings.east_m, soundings.north_m[:, None] - soundings.north_m
-    )
-    across = float(np.mean(np.sum(np.exp(-apart / length_m), axis=1))) if soundings.count else 1.0
-    return float(min(along * across, _MOST_SHARING))
+    return min(along * across / max(east_m.size, 1), _MOST_SHARING)
 
 
 @numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"})

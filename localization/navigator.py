@@ -397,10 +397,9 @@ class Navigator:
         if len(arrays["bank_weight"]):
             self.bank.start(*self.reckoned)
             for i, f in enumerate(self.bank.filters):
-                f.filter.x[:] = arrays[f"filter_{i}_x"]
-                f.filter.P[:] = arrays[f"filter_{i}_p"]
+                f.take(arrays[f"filter_{i}_x"], arrays[f"filter_{i}_p"])
             self.bank.log_weight[:] = arrays["bank_weight"]
-        self.velocity = arrays["velocity"]
+        self.velocity = np.asarray(arrays["velocity"])
         self.rival.known, self.rival.misses = arrays["rival"], words["misses"]
         self.seen_times = set(arrays["seen"].tolist())
         self.health.reset()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from localization.likelihood import bias_marginal, sounding_noise
+from localization.likelihood import GATE, sounding_noise
 from localization.measurements import Soundings
 from localization.terrain import TerrainMap
 from perception.records import FloatArray
@@ -59,6 +59,7 @@ class ParticleFilter:
         self.wide = max(wide or 4 * count, count)
         self.rng = rng
         self.cloud = _empty_cloud(1)
+        self.work = np.empty((7, 1), np.float32)
         # On a slope, range noise is horizontal too; the map's rms slope says how much.
         cell = terrain.cell_m
         self.slope = float(np.sqrt(2 * terrain.structure_m2(np.array([cell]))[0])) / cell
@@ -112,18 +113,20 @@ class ParticleFilter:
 
         Returns
         -------
-        The greatest share of soundings that fit at any particle: 0 when all are off the map.
+        The share of soundings that fit, over all particles: 0 when all are off the map.
         """
         noise = sounding_noise(soundings, self.terrain, self.slope, step_m)
         c = self.cloud
-        effective, fitting = _weigh(
+        if self.work.shape[1] != c.count:
+            self.work = np.empty((7, c.count), np.float32)
+        effective, fitting = weigh(
             self.terrain.height_m, self.terrain.frame, c.east, c.north, c.turn, c.bias, c.bias_var,
             c.log_weight, easting_m, northing_m, soundings.east_m, soundings.north_m,
-            soundings.elevation_m, noise.inflated_m2, bias_walk_m2,
+            soundings.elevation_m, noise.inflated_m2, bias_walk_m2, self.work,
         )  # fmt: skip
         if effective < 0.5 * c.count:
             self._resample()
-        return fitting / max(soundings.count, 1)
+        return fitting / max(soundings.count * c.count, 1)
 
     def fuse(self, offset_m: FloatArray, covariance_m2: FloatArray) -> None:
         """Weigh the cloud by an outside fix (2,) of the offset; one in twenty may be wrong."""
@@ -192,31 +195,80 @@ def _move(east, north, turn, scale, step_e, step_n, walk, noise):  # type: ignor
         north[i] += scale[i] * step_n - turn[i] * step_e + walk * noise[1, i]
 
 
-@numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"})
-def _weigh(  # type: ignore[no-untyped-def]
-    heights, frame, east, north, turn, bias, bias_var, log_weight, pe, pn, oe, on, z, r, walk
+@numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"}, error_model="numpy")
+def weigh(  # type: ignore[no-untyped-def]
+    heights, frame, east, north, turn, bias, bias_var, log_weight, pe, pn, oe, on, z, r, walk, work
 ):
-    """Add log likelihoods, normalise the greatest to 0; return the effective number and the fit."""
-    top = -np.inf
-    met = 0
+    """Add every particle's log likelihood; see `localization.likelihood.bias_marginal`.
+
+    The same sums, beam by beam over all particles in single precision and without branches, so that
+    the compiler turns them into vector instructions; `work` is (7, n) float32 scratch.
+
+    Returns
+    -------
+    effective number of particles, number of fits (0 where nothing meets the map)
+    """
+    one, zero, gate = np.float32(1.0), np.float32(0.0), np.float32(GATE * GATE)
+    rows, cols = heights.shape
+    flat = heights.ravel()
+    per_e, per_n = 1.0 / frame[2], 1.0 / frame[3]
+    top_col, top_row, width = np.float32(cols - 1.001), np.float32(rows - 1.001), np.int32(cols)
+    col_0, row_0, twist, m, v, total, scale = work
     for i in range(east.size):
-        gain, bias[i], bias_var[i], fitting = bias_marginal(
-            heights, frame, east[i], north[i], turn[i], bias[i], bias_var[i], pe, pn, oe, on, z, r,
-            walk,
-        )  # fmt: skip
-        log_weight[i] += gain
-        met = max(met, fitting)
-        top = max(top, log_weight[i])
+        col_0[i], row_0[i], twist[i] = east[i] * per_e, north[i] * per_n, turn[i]
+        m[i], v[i] = bias[i], bias_var[i] + walk
+        total[i], scale[i] = zero, one
+    fitting = 0
+    for j in range(z.size):
+        # What is common to all particles is summed in double precision: a map is 1e6 m from 0.
+        col_j = np.float32((pe + oe[j] - frame[0]) * per_e)
+        row_j = np.float32((frame[1] - pn - on[j]) * per_n)
+        turn_col, turn_row = np.float32(on[j] * per_e), np.float32(oe[j] * per_n)
+        z_j, r_j = np.float32(z[j]), np.float32(r[j])
+        for i in range(east.size):
+            col = col_j + col_0[i] + twist[i] * turn_col
+            row = row_j - row_0[i] + twist[i] * turn_row
+            col_in = min(max(col, zero), top_col)
+            row_in = min(max(row, zero), top_row)
+            c, k = np.int32(col_in), np.int32(row_in)
+            f_col, f_row = col_in - np.float32(c), row_in - np.float32(k)
+            at = k * width + c
+            top = flat[at] + f_col * (flat[at + np.int32(1)] - flat[at])
+            low = flat[at + width]
+            low = low + f_col * (flat[at + width + np.int32(1)] - low)
+            height = top + f_row * (low - top)
+            s = v[i] + r_j
+            y = z_j - height - m[i]
+            q = y * y / s
+            known = (col_in == col) & (row_in == row) & (height == height)
+            fits = known & (q <= gate)
+            gain = v[i] / s if fits else zero
+            total[i] += (q if fits else gate) if known else one
+            scale[i] *= s
+            m[i] += gain * y if fits else zero
+            v[i] -= gain * v[i]
+            fitting += fits
+    best = -np.inf
+    for i in range(east.size):
+        bias[i], bias_var[i] = m[i], v[i]
+        log_weight[i] -= 0.5 * (total[i] + np.log(scale[i]))
+        best = max(best, log_weight[i])
+    return _effective(log_weight, best), fitting
+
+
+@numba.njit(cache=True)
+def _effective(log_weight, best):  # type: ignore[no-untyped-def]
+    """Bring the greatest log weight to 0; return the effective number of particles."""
     total = 0.0
     square = 0.0
-    for i in range(east.size):
-        log_weight[i] -= top
+    for i in range(log_weight.size):
+        log_weight[i] -= best
         # Below e^-30 a particle is dead weight: spare the exponential.
         if log_weight[i] > -30.0:
-            w = np.exp(log_weight[i])
+            w = np.exp(np.float32(log_weight[i]))
             total += w
             square += w * w
-    return total * total / square, met
+    return total * total / square
 
 
 @numba.njit(cache=True)

@@ -48,7 +48,7 @@ class Evidence:
     def reset(self) -> None:
         """Forget the soundings: the depth sensor stepped, or another place is tried."""
         # Columns: easting, northing, elevation, elevation less map, variances of the two.
-        self.known = np.zeros((0, 6))
+        self.known: FloatArray = np.zeros((0, 6))
         self.misses = 0
 
     def update(self, view: View, assumed: Hypothesis) -> float:

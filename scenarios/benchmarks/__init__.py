@@ -13,8 +13,15 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "experiments": ("experiments", "the experiment runner: overhead, memory, sameness"),
     "sonar-files": ("sonar_files", "reading sonar files: pings a second, memory at 1x and 10x"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
+    "navigation": (
+        "navigation",
+        "Position from terrain: error, bound, honesty, time per update, peers.",
+    ),
     "planning": ("planning", "Routes: cost against the grid search, parts switched off, peers."),
-    "regions": ("regions", "H-K regions: signs under noise and seconds, beside fixed scales and peers"),
+    "regions": (
+        "regions",
+        "H-K regions: signs under noise and seconds, beside fixed scales and peers",
+    ),
 }
 
 
