@@ -471,7 +471,7 @@ class Problem:
             b_z += (self.rows.T @ draw).reshape(self.shape)
         n = len(self.gain_precision)
         b_g = np.bincount(self.knot.ravel(), (noise[:, None] * self.share).ravel(), n)
-        b_g += np.linalg.cholesky(self.gain_precision) @ rng.standard_normal(n)
+        b_g = b_g + np.linalg.cholesky(self.gain_precision) @ rng.standard_normal(n)
         return b_z, b_a, b_g
 
     def solve(
@@ -495,6 +495,8 @@ class Problem:
         p = s
         rs = _dot(r, s)
         first = rs
+        if first <= 0.0:  # the start solves it: a flat floor under a flat start leaves no residual
+            return x, 0
         for k in range(most):
             y = self.apply(*p)
             alpha = rs / _dot(p, y)
