@@ -44,6 +44,37 @@ def neighbourhood(n: int) -> tuple[IntArray, IntArray, IntArray]:
     return np.array(moves), np.array(passed or [(0, 0)]), np.array(first)
 
 
+def crossings(moves: IntArray) -> tuple[IntArray, FloatArray, IntArray]:
+    """Return where each straight move crosses grid lines between its ends.
+
+    Without them a knight's move would average its two ends and not see the ground it passes: on patchy
+    weights that undercuts the true integral by ten per cent and more.
+
+    Returns
+    -------
+    nodes : (m, 4) the two nodes (row, col, row, col) beside each crossing.
+    parts : (m, 2) share of the second node, and the crossing's place along the move in (0, 1).
+    first : (n + 1,) start of each move's crossings.
+    """
+    nodes: list[tuple[int, int, int, int]] = []
+    parts: list[tuple[float, float]] = []
+    first = [0]
+    for r, c in moves:
+        places = {k / abs(int(n)) for n in (r, c) if n for k in range(1, abs(int(n)))}
+        for t in sorted(places):
+            y, x = round(t * int(r), 9), round(t * int(c), 9)
+            i, j = math.floor(y), math.floor(x)
+            on_row = y == i
+            nodes.append((i, j, i, j + 1) if on_row else (i, j, i + 1, j))
+            parts.append((x - j if on_row else y - i, t))
+        first.append(len(nodes))
+    return (
+        np.array(nodes or [(0, 0, 0, 0)]),
+        np.array(parts or [(0.0, 0.0)]),
+        np.array(first),
+    )
+
+
 def _squares(r: int, c: int) -> list[tuple[int, int]]:
     """Return the nodes, ends apart, whose bilinear squares the straight move (r, c) crosses."""
     nodes: set[tuple[int, int]] = set()
@@ -91,7 +122,8 @@ def search(
 ) -> Field:
     """Search from `source` at the floor, without limits of pitch, turn or ceiling.
 
-    An edge costs the mean weight of its ends times its length in space over the least heights.
+    An edge costs the integral of the weight over its length in space along the least heights, both
+    linear between the grid lines that it crosses.
 
     Parameters
     ----------
@@ -101,7 +133,8 @@ def search(
     moves, passed, first = neighbourhood(neighbours)
     cost, move = _search(
         surface.stack, surface.barred, surface.cell_m[0], surface.cell_m[1],
-        moves, passed, first, source, target if target is not None else (-1, -1),
+        moves, passed, first, *crossings(moves), source,
+        target if target is not None else (-1, -1),
     )  # fmt: skip
     return Field(cost, move, moves, source)
 
@@ -141,7 +174,8 @@ def _greatest_edge(stack, width, height, reach):  # type: ignore[no-untyped-def]
             if c + 1 < cols:
                 drop = max(drop, abs(stack[r, c + 1, LOWER] - stack[r, c, LOWER]))
     run = reach * max(width, height) * 1.4143
-    return least_w, greatest_w * math.hypot(run, 2.0 * reach * drop)
+    # Between grid lines an edge may climb and fall again: five pieces at most.
+    return least_w, greatest_w * math.hypot(run, 5.0 * reach * drop)
 
 
 @njit(cache=True)
@@ -160,7 +194,9 @@ def _near_bars(barred, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _search(stack, barred, width, height, moves, passed, first, source, target):  # type: ignore[no-untyped-def]
+def _search(  # type: ignore[no-untyped-def]
+    stack, barred, width, height, moves, passed, first, nodes, parts, cut, source, target
+):
     rows, cols = barred.shape
     reach = 0
     for m in range(len(moves)):
@@ -211,10 +247,23 @@ def _search(stack, barred, width, height, moves, passed, first, source, target):
             rr, cc = r + moves[m, 0], c + moves[m, 1]
             if rr < 0 or cc < 0 or rr >= rows or cc >= cols or barred[rr, cc]:
                 continue
-            dz = stack[rr, cc, LOWER] - z
-            there = np.float32(
-                here + 0.5 * (w + stack[rr, cc, WEIGHT]) * math.sqrt(run[m] + dz * dz)
-            )
+            # Most neighbours are settled: no edge is shorter than its run over the best ground.
+            if here + least_w * math.sqrt(run[m]) >= cost[rr, cc]:
+                continue
+            edge, t0, w0, z0 = 0.0, 0.0, w, z
+            for k in range(cut[m], cut[m + 1]):
+                a = stack[r + nodes[k, 0], c + nodes[k, 1]]
+                b = stack[r + nodes[k, 2], c + nodes[k, 3]]
+                share, t1 = parts[k, 0], parts[k, 1]
+                w1 = a[WEIGHT] + share * (b[WEIGHT] - a[WEIGHT])
+                z1 = a[LOWER] + share * (b[LOWER] - a[LOWER])
+                flat = (t1 - t0) * (t1 - t0) * run[m]
+                edge += 0.5 * (w0 + w1) * math.sqrt(flat + (z1 - z0) * (z1 - z0))
+                t0, w0, z0 = t1, w1, z1
+            w1, z1 = stack[rr, cc, WEIGHT], stack[rr, cc, LOWER]
+            flat = (1.0 - t0) * (1.0 - t0) * run[m]
+            edge += 0.5 * (w0 + w1) * math.sqrt(flat + (z1 - z0) * (z1 - z0))
+            there = np.float32(here + edge)
             if there >= cost[rr, cc]:
                 continue
             if check:

@@ -115,7 +115,7 @@ def thinned(surface: Surface, nodes: int = _NODES) -> Thin:
     """Return the map thinned to about so many nodes: means of blocks, barred if half is."""
     rows, cols = surface.shape
     block = max(1, math.ceil(math.sqrt(rows * cols / nodes)))
-    lower = _blocks(np.maximum(surface.stack[..., LOWER], surface.bottom_most_m), block)
+    lower = np.maximum(_blocks(surface.stack[..., LOWER], block), surface.bottom_most_m)
     bottom = _blocks(surface.stack[..., BOTTOM], block)
     weight = _blocks(surface.stack[..., WEIGHT], block)
     # A thin wall must not leak in the mean: any line of barred cells that parts the block bars it.
@@ -129,14 +129,20 @@ def thinned(surface: Surface, nodes: int = _NODES) -> Thin:
     return Thin(lower, bottom, upper, weight, barred, stack, cell, shift, surface)
 
 
-def _blocks(values: FloatArray, block: int) -> FloatArray:
+@njit(cache=True)
+def _blocks(values, block):  # type: ignore[no-untyped-def]
     """Return means of block x block cells; the last row and column of blocks may be partial."""
-    if block == 1:
-        return np.array(values, float)
     rows, cols = values.shape
-    padded = np.pad(values, ((0, -rows % block), (0, -cols % block)), mode="edge")
-    shape = (padded.shape[0] // block, block, padded.shape[1] // block, block)
-    return np.asarray(padded.reshape(shape).mean(axis=(1, 3)), float)
+    out = np.empty((-(-rows // block), -(-cols // block)))
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total, n = 0.0, 0
+            for r in range(i * block, min((i + 1) * block, rows)):
+                for c in range(j * block, min((j + 1) * block, cols)):
+                    total += values[r, c]
+                    n += 1
+            out[i, j] = total / n
+    return out
 
 
 def _walls(barred: BoolArray, block: int) -> BoolArray:
@@ -147,12 +153,16 @@ def _walls(barred: BoolArray, block: int) -> BoolArray:
 
 def cost_to_go(thin: Thin, goal: tuple[int, int]) -> FloatArray:
     """Return the limit-free cost from every thinned node to the goal."""
-    rough = Surface(
+    return search(thin_surface(thin), goal, None, 16).cost
+
+
+def thin_surface(thin: Thin) -> Surface:
+    """Return the thinned map as a surface of its own, its first node at the origin."""
+    return Surface(
         bottom_m=thin.bottom, lower_m=thin.lower, barred=thin.barred, stack=thin.stack,
         origin_m=(0.0, 0.0), cell_m=thin.cell_m, top_m=thin.surface.top_m,
         limits=thin.surface.limits, terms=thin.surface.terms,
     )  # fmt: skip
-    return search(rough, goal, None, 16).cost
 
 
 # Price per metre of path and metre above the ceiling in a soft search.

@@ -16,11 +16,11 @@ from planning.corridor import make_corridor
 from planning.cost import CostTerms
 from planning.curve import waypoints
 from planning.failure import Blockage, explain_barrier, explain_limits
-from planning.field import search
 from planning.finish import exact_cost, finish
 from planning.layers import cost_to_go, layered_path, thinned
 from planning.limits import VehicleLimits
 from planning.polish import RADIUS_RESERVE, Candidate, control_spacing, polish, smooth_guide
+from planning.pyramid import guided_search
 from planning.risk import clearance_factor, clearance_sigma, patches_crossed
 from planning.route import Route, route_of
 from planning.surface import Surface, build_surface, cautious
@@ -160,8 +160,7 @@ def _plan_on(
 
     node_a = end_node(surface, start, "start")
     node_b = end_node(surface, goal, "goal")
-    field_ = search(surface, node_a, node_b, config.neighbours)
-    grid_cost = float(field_.cost[node_b])
+    grid_cost, nodes = guided_search(surface, node_a, node_b, config.neighbours)
     lap("grid_s")
     bound = lower_bound(surface, start, goal)
     lap("bound_s")
@@ -172,7 +171,6 @@ def _plan_on(
             None, parted.reason, math.nan, bound, k, patches, surface, np.zeros((0, 2)), stages,
             blockage=parted,
         )  # fmt: skip
-    nodes = field_.path(*node_b)
     guide = np.column_stack([nodes[:, 1] * surface.cell_m[0], nodes[:, 0] * surface.cell_m[1]])
     guide = np.concatenate([ends[:1], guide[1:-1], ends[1:]])
     candidates = _from_guides(surface, guide, ends, config)

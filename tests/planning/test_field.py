@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
@@ -17,6 +18,18 @@ from tests.planning.terrains import canyon, flat, grid_of
 
 def surface_of(z: np.ndarray, weight: np.ndarray | None = None) -> Surface:
     return build_surface(grid_of(z), VehicleLimits(), CostTerms(), weight)
+
+
+def _edge(
+    z: np.ndarray, w: np.ndarray, a: np.ndarray, b: np.ndarray, dr: int, dc: int
+) -> np.ndarray:
+    """Integrate weight over length in space along straight moves, linear between grid lines."""
+    cuts = {0.0, 1.0} | {k / abs(n) for n in (dr, dc) if n for k in range(abs(n))}
+    t = np.array(sorted(cuts))
+    at = np.array([a[:, None] + dr * t, b[:, None] + dc * t])
+    heights, weights = (ndimage.map_coordinates(v, at, order=1, mode="nearest") for v in (z, w))
+    length = np.sqrt(np.diff(t) ** 2 * (dr**2 + dc**2) + np.diff(heights, axis=1) ** 2)
+    return (0.5 * (weights[:, 1:] + weights[:, :-1]) * length).sum(axis=1)
 
 
 def _reference(surface: Surface, source: tuple[int, int], n: int) -> np.ndarray:
@@ -34,10 +47,9 @@ def _reference(surface: Surface, source: tuple[int, int], n: int) -> np.ndarray:
         for i, j in passed[first[m] : first[m + 1]]:
             ok &= ~surface.barred[a + i, b + j]
         a, b = a[ok], b[ok]
-        dz = z[a + dr, b + dc] - z[a, b]
         heads.append(a * cols + b)
         tails.append((a + dr) * cols + b + dc)
-        costs.append(0.5 * (w[a, b] + w[a + dr, b + dc]) * np.sqrt(dr**2 + dc**2 + dz**2))
+        costs.append(_edge(z, w, a, b, int(dr), int(dc)))
     shape = (rows * cols, rows * cols)
     graph = coo_matrix(
         (np.concatenate(costs), (np.concatenate(heads), np.concatenate(tails))), shape
@@ -74,9 +86,12 @@ def test_the_path_is_the_one_that_the_cost_is_of():
     field = search(surface, (3, 3), (70, 75))
     path = field.path(70, 75)
     assert tuple(path[0]) == (3, 3) and tuple(path[-1]) == (70, 75)
-    z = surface.lower_m[path[:, 0], path[:, 1]]
-    length = np.sqrt((np.diff(path, axis=0) ** 2).sum(axis=1) + np.diff(z) ** 2).sum()
-    assert_allclose(field.cost[70, 75], length, rtol=1e-5)
+    z, w = surface.lower_m, np.ones(surface.shape)
+    legs = [
+        _edge(z, w, path[i : i + 1, 0], path[i : i + 1, 1], *np.diff(path[i : i + 2], axis=0)[0])[0]
+        for i in range(len(path) - 1)
+    ]
+    assert_allclose(field.cost[70, 75], sum(legs), rtol=1e-5)
 
 
 def test_no_move_slips_through_a_wall_of_one_cell_or_across_its_corners():
