@@ -42,10 +42,12 @@ _WIDTHS = (2.0, 2.0 * np.sqrt(2.0))
 # Sigma of the fit before thinning by two: what would alias into the passband of the narrowest fit on the
 # thinned grid (2.7 rad a cell) is cut to 0.25 %, the passband itself (0.25 rad) droops by 0.3 %.
 _THINNING = 1.5
-# The local mean of the bands' energy: Gaussian of this many a_k. Narrower and chance decides.
-_WINDOW = 3.4
-# Energy above the noise counts from this excess on: the local mean of noise alone scatters by 15 %.
-_EXCESS = 0.3
+# The local mean of the bands' energy: Gaussian of this many a_k. Wider, and a sharp hill keeps the smooth
+# ground about it at its own fine scale.
+_WINDOW = 1.2
+# Energy above the noise counts from this excess on, in shares of the noise: so narrow a mean of noise
+# alone scatters by half, and its tail must not pass for relief.
+_EXCESS = 2.0
 # Standard deviation of r, s, t together and of r + t behind `fit_twice`, against that far from any edge, by
 # the distance to the edge in sigmas of the fit; measured on white noise (tests/perception/test_scale.py).
 _RIM = np.array([0, 0.125, 0.25, 0.375, 0.55, 0.65, 0.75, 0.9, 1.12, 1.38, 1.62, 2.0])
