@@ -44,6 +44,8 @@ _MOST_EVIDENCE, _LEAST_EVIDENCE, _REFUTED, _ALLOWANCE = 30.0, -6.0, 15.0, 0.1
 _SILENT_S = 15.0
 # A step longer than this, and faster than both speeds below, is a reset of dead reckoning.
 _LEAST_JUMP_M, _SLOW_M_S, _FASTER = 10.0, 5.0, 5.0
+# What may have gone wrong unseen since the last trusted state, an axis.
+_LOST_M = 10.0
 # Speed error assumed while the navigation itself gives no position.
 _BLIND_M_S = 0.5
 
@@ -346,10 +348,7 @@ class Navigator:
         if self.trusted:
             self.reckoned = self.trusted[0]
             self.trusted = []
-        mean, covariance = self.reckoned
-        growth = self.config.grow ** (2 * min(self.losses - 1, 4))
-        box = covariance.copy()
-        box[:2, :2] = growth * (box[:2, :2] + 10.0**2 * np.eye(2))
+        mean, box = self.reckoned[0], self._box()
         box[4, :], box[:, 4] = 0.0, 0.0
         box[4, 4] = self.config.reset_depth_m**2
         self.tracking, self.proved, self.converged_once = False, 0, False
@@ -357,6 +356,13 @@ class Navigator:
         self.search.start(mean, box)
         logger.info("lost: %s", reason)
         return f"lost: {reason}; searching again within {math.sqrt(_largest2(box)):.0f} m"
+
+    def _box(self) -> FloatArray:
+        """Covariance to search in, and to tell, after a loss: it grows with every one."""
+        growth = self.config.grow ** (2 * min(self.losses - 1, 4))
+        box = self.reckoned[1].copy()
+        box[:2, :2] = growth * (box[:2, :2] + _LOST_M**2 * np.eye(2))
+        return box
 
     # ---- saving ----------------------------------------------------------------------------------
 
@@ -428,9 +434,7 @@ class Navigator:
     def _belief(self, m: Measurement) -> tuple[FloatArray, FloatArray, str]:
         silent = m.time_s - self.heard_s > _SILENT_S
         if self.losses:
-            mean, covariance = self.reckoned
-            grown = covariance + 10.0**2 * np.diag([1.0, 1.0, 0, 0, 0])
-            return mean, grown, RECKONING if silent else LOST
+            return self.reckoned[0], self._box(), RECKONING if silent else LOST
         if self.tracking:
             mean, covariance = self.bank.moments()
             proved = self._is_proved()
@@ -459,8 +463,12 @@ class Navigator:
 
 
 def _doubt(evidence: float) -> float:
-    """Probability that a place is the wrong one, given the evidence for it."""
-    return _DOUBT / (_DOUBT + (1 - _DOUBT) * math.exp(max(evidence, -30.0)))
+    """Probability that a place not yet proved is the wrong one; evidence against it raises that.
+
+    Evidence for it counts once the match is proved, not before: a lucky ping is no proof.
+    """
+    against = math.exp(min(max(evidence, -30.0), 0.0))
+    return _DOUBT / (_DOUBT + (1 - _DOUBT) * against)
 
 
 def _largest2(covariance: FloatArray) -> float:
