@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from perception.records import (
+    BoolArray,
     ElevationStrip,
     FloatArray,
     Grid,
@@ -271,16 +272,10 @@ def combine(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Combine passes into mean, sigma of the mean and count, each of `shape`, rows south to north."""
     keep = [np.isfinite(r.height_m) for r in rasters]
-    weight, total, number = _sums(rasters, keep, shape)
-    # Leave-one-out: a wrong pass must not pull the mean that it is judged by.
-    for index, r in enumerate(rasters):
-        w = np.where(keep[index], 1.0 / r.variance_m2, 0.0)
-        others = weight[r.window] - w
-        several = keep[index] & (number[r.window] >= 3) & (others > 0)
-        safe = np.where(several, others, 1.0)
-        rest = (total[r.window] - w * np.nan_to_num(r.height_m)) / safe
-        allowed = _OUTLIER_SIGMA * np.sqrt(np.nan_to_num(r.variance_m2) + 1.0 / safe)
-        keep[index] = keep[index] & ~(several & (np.abs(r.height_m - rest) > allowed))
+    # Three rounds find up to three wrong passes in a cell; more than that and there is no majority.
+    for _ in range(3):
+        if not _drop_worst(rasters, keep, shape):
+            break
     weight, total, number = _sums(rasters, keep, shape)
     filled = weight > 0
     safe = np.where(filled, weight, 1.0)
@@ -297,8 +292,37 @@ def combine(
     return mean, np.where(filled, np.sqrt(variance), np.nan), count
 
 
+def _drop_worst(
+    rasters: Sequence[PassRaster], keep: list[BoolArray], shape: tuple[int, int]
+) -> bool:
+    """Drop from each cell the pass farthest beyond four sigma of the others' mean; tell if any was.
+
+    A wrong pass must not pull the mean that it is judged by, so each is judged by the rest; and it spoils
+    the rest of every other, so only the worst goes at a time.
+    """
+    weight, total, number = _sums(rasters, keep, shape)
+    worst = np.full(shape, _OUTLIER_SIGMA)
+    ratios = []
+    for r, k in zip(rasters, keep, strict=True):
+        w = np.where(k, 1.0 / r.variance_m2, 0.0)
+        others = weight[r.window] - w
+        several = k & (number[r.window] >= 3) & (others > 1e-12)
+        safe = np.where(several, others, 1.0)
+        rest = (total[r.window] - w * np.where(k, r.height_m, 0.0)) / safe
+        expected = np.sqrt(np.where(k, r.variance_m2, 0.0) + 1.0 / safe)
+        ratio = np.where(several, np.abs(np.where(k, r.height_m, 0.0) - rest) / expected, 0.0)
+        worst[r.window] = np.maximum(worst[r.window], ratio)
+        ratios.append(ratio)
+    dropped = False
+    for index, (r, ratio) in enumerate(zip(rasters, ratios, strict=True)):
+        drop = (ratio > _OUTLIER_SIGMA) & (ratio >= worst[r.window])
+        dropped = dropped or bool(drop.any())
+        keep[index] = keep[index] & ~drop
+    return dropped
+
+
 def _sums(
-    rasters: Sequence[PassRaster], keep: Sequence[np.ndarray], shape: tuple[int, int]
+    rasters: Sequence[PassRaster], keep: Sequence[BoolArray], shape: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     weight, total, number = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for r, k in zip(rasters, keep, strict=True):

@@ -44,7 +44,11 @@ class Footprint:
 
 def footprint(strip: ElevationStrip, side_m: float) -> Footprint:
     """Return which squares of the lattice of width `side_m` the strip covers, and from which lines."""
+    nothing = np.zeros(0)
+    empty = Footprint(nothing.astype(int), nothing.astype(int), nothing, nothing)
     lines = np.arange(len(strip.time_s))
+    if len(lines) < 2:
+        return empty
     # Eight samples a square suffice to tell its cover.
     step = np.median(np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m)) + 1e-9)
     every_line = max(1, int(side_m / 8 / max(float(step), 1e-3)))
@@ -57,8 +61,7 @@ def footprint(strip: ElevationStrip, side_m: float) -> Footprint:
     east, north = easting_m[chosen][seen], northing_m[chosen][seen]
     which = np.broadcast_to(lines[:, None], seen.shape)[seen]
     if not len(east):
-        nothing = np.zeros(0)
-        return Footprint(nothing.astype(int), nothing.astype(int), nothing, nothing)
+        return empty
     column = np.floor(east / side_m).astype(np.int64)
     row = np.floor(north / side_m).astype(np.int64)
     squares, inverse = np.unique(np.column_stack([column, row]), axis=0, return_inverse=True)

@@ -208,7 +208,7 @@ def _judge(
     offset, covariance, lobe = refine(fields, gains, best, inner)
     if covariance is None or np.abs(offset).max() > 1.5:
         return best, nothing, evidence, 0.0, "no clear peak"
-    # A tenth of a cell is what sampling on a grid leaves of any peak.
+    # A tenth of a cell is what two samplings of one ground leave of any peak (docs/registration.md).
     covariance = (covariance + 0.1**2 * np.eye(2)) * cell_m**2
     reach_of_peak = np.maximum(3.0 * lobe * np.sqrt(max(evidence, 1.0)), 3.0)
     far = (np.abs(steps[:, None] - best[1]) > reach_of_peak[1]) | (

@@ -95,7 +95,7 @@ def texture(
     share = uniform_filter(loud.astype(np.float32), fine, mode="constant")
     level = np.log(np.maximum(power, 1e-6) / np.maximum(share, 1e-6))
     level = _highpass(np.clip(level, -2.0, 2.0), loud.astype(np.float32), size)
-    level = _evened(level, loud.astype(np.float32), (2 * size[0], 2 * size[1]))
+    level = _evened(level, loud.astype(np.float32), (2 * size[0] + 1, 2 * size[1] + 1))
     # Near nadir an echo tells nothing about slope, and the two sides meet.
     off_nadir = np.abs(strip.across_m) > 0.4 * np.nan_to_num(strip.altitude_m)[:, None]
     for side, channel in ((-1, PORT), (1, STARBOARD)):
@@ -133,8 +133,10 @@ def placed_across(strip: ElevationStrip, floor: Grid | None) -> FloatArray:
 
 
 def _filter_size(strip: ElevationStrip, width_m: float, least: int = 3) -> tuple[int, int]:
+    """Return lines and columns of a box about `width_m` wide: odd, as an even one shifts by half a sample."""
     step, spacing = _spacings(strip)
-    return max(least, round(width_m / step)), max(least, round(width_m / spacing))
+    lines, columns = (max(least, 2 * round((width_m / d - 1.0) / 2.0) + 1) for d in (step, spacing))
+    return lines, columns
 
 
 def _highpass(values: FloatArray, weight: FloatArray, size: tuple[int, int]) -> FloatArray:
@@ -183,7 +185,7 @@ def _landmarks(strip: ElevationStrip, level: FloatArray) -> FloatArray:
         final = shadow & ~np.pad(shadow, ((0, 0), (0, 1)))[:, 1:]
         starts, ends = _edge_means(label, first, count), _edge_means(label, final, count)
         reach = max(1, round(1.5 / spacing))
-        bright = uniform_filter(level[:, columns], (3, reach))
+        bright = uniform_filter(level[:, columns], (3, 2 * (reach // 2) + 1))
         for k in range(1, count + 1):
             if area[k] < 1.0 or starts[k, 2] < 3:
                 continue

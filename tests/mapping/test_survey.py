@@ -1,0 +1,108 @@
+"""The survey's loop on a small world: drift goes, bad input has a clear outcome."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapping.fixes import PositionFix
+from mapping.survey import SurveyConfig, correct_survey
+from perception.records import InputError
+from tests.mapping.worlds import Drift, Flight, fly, make_world
+
+LEGS = [
+    (100.0, 40.0, 0.0, 160.0),
+    (150.0, 200.0, 180.0, 160.0),
+    (205.0, 110.0, 270.0, 160.0),
+]
+
+
+@pytest.fixture(scope="module")
+def flown() -> list[Flight]:
+    rng = np.random.default_rng(2)
+    return fly(make_world(rng, size=256), LEGS, rng, Drift(8.0, 0.4, 0.004))
+
+
+def fixes(flown: list[Flight]) -> list[PositionFix]:
+    return [
+        PositionFix(
+            f.strip.time_s[k], f.true_easting_m[k], f.true_northing_m[k], 0.16, 0.0, 0.16, "gps"
+        )
+        for f, k in ((flown[0], 0), (flown[-1], -1))
+    ]
+
+
+def error(flown: list[Flight], easting_m: np.ndarray, northing_m: np.ndarray) -> float:
+    east = easting_m - np.concatenate([f.true_easting_m for f in flown])
+    north = northing_m - np.concatenate([f.true_northing_m for f in flown])
+    return float(np.sqrt((east**2 + north**2).mean()))
+
+
+def test_drift_goes_and_what_is_left_is_said(flown: list[Flight]) -> None:
+    strips = [f.strip for f in flown]
+    corrected = correct_survey(strips, fixes(flown), SurveyConfig(rounds=3))
+    before = error(
+        flown,
+        np.concatenate([s.easting_m for s in strips]),
+        np.concatenate([s.northing_m for s in strips]),
+    )
+    track = corrected.trajectory
+    after = error(flown, track.easting_m, track.northing_m)
+    assert after < 0.5 * before
+    said = float(np.sqrt((track.sigma_easting_m**2 + track.sigma_northing_m**2).mean()))
+    assert after < 2.0 * said
+    assert corrected.diagnostics.rounds[-1].used >= 3
+    assert not corrected.diagnostics.worsened and not corrected.diagnostics.indeterminate
+    assert len(track.time_s) == sum(len(s.time_s) for s in strips)
+    for strip, moved in zip(strips, corrected.strips, strict=True):
+        assert moved.echo is strip.echo
+
+
+def test_passes_that_never_meet_stay_on_their_navigation() -> None:
+    rng = np.random.default_rng(5)
+    legs = [(60.0, 20.0, 0.0, 80.0), (400.0, 20.0, 0.0, 80.0)]
+    flown = fly(make_world(rng, size=512), legs, rng, Drift(0.0, 0.0, 0.0))
+    corrected = correct_survey([f.strip for f in flown])
+    assert corrected.registrations == ()
+    for f, strip in zip(flown, corrected.strips, strict=True):
+        np.testing.assert_allclose(strip.easting_m, f.strip.easting_m, atol=1e-6)
+
+
+def test_a_strip_wholly_nan_harms_no_other(flown: list[Flight]) -> None:
+    strips = [f.strip for f in flown]
+    nothing = np.full_like(strips[1].echo, np.nan)
+    strips[1] = replace(strips[1], echo=nothing, elevation_m=nothing)
+    corrected = correct_survey(strips, config=SurveyConfig(rounds=1))
+    assert np.isfinite(corrected.trajectory.easting_m).all()
+    assert all(1 not in (r.window.first, r.window.second) for r in corrected.registrations)
+
+
+def test_a_clock_that_jumps_back_parts_the_passes_without_harm(flown: list[Flight]) -> None:
+    strips = [f.strip for f in flown]
+    strips[2] = replace(strips[2], time_s=strips[2].time_s - 86_400.0)
+    corrected = correct_survey(strips, config=SurveyConfig(rounds=1))
+    assert np.isnan(corrected.keyframes.way_m[corrected.keyframes.starts[2]])
+    assert np.isfinite(corrected.trajectory.easting_m).all()
+
+
+def test_a_pass_of_one_line_is_kept(flown: list[Flight]) -> None:
+    strip = flown[0].strip
+    one = {
+        name: getattr(strip, name)[:1]
+        for name in (
+            "elevation_m", "sigma_m", "echo", "shadow", "time_s", "ping", "easting_m", "northing_m",
+            "depth_m", "heading_rad", "altitude_m", "altitude_sigma_m",
+        )
+    }  # fmt: skip
+    corrected = correct_survey([strip, replace(strip, **one)], config=SurveyConfig(rounds=1))
+    assert len(corrected.strips[1].time_s) == 1
+
+
+def test_nothing_and_two_zones_are_refused(flown: list[Flight]) -> None:
+    with pytest.raises(InputError, match="holds no strip"):
+        correct_survey([])
+    other = replace(flown[1].strip, crs="EPSG:32631")
+    with pytest.raises(InputError, match="different coordinate systems"):
+        correct_survey([flown[0].strip, other])
