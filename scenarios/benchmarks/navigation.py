@@ -29,7 +29,7 @@ from scenarios.benchmarks.navigation_sets import (
     spectral_floor,
 )
 
-RUNS = 4
+RUNS = 3
 # A fix is false when it claims less than this and is off by more than that.
 _CLAIMED_M, _OFF_M = 10.0, 25.0
 

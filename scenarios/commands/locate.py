@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import click
@@ -67,7 +68,7 @@ def command(
     if follow:
         from scenarios.locating_live import follow_input
 
-        follow_input(options, out, click.get_text_stream("stdin"), click.echo)
+        follow_input(options, out, sys.stdin, click.echo)
         return
     assert out is not None
     prepare_out(out)

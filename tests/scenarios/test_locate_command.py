@@ -1,0 +1,129 @@
+"""`bathynav locate` as a user calls it: files in, files out, one plain line when it cannot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner, Result
+
+from mapping.rasters import write_map
+from perception.records import Grid, InputError, NoOverlapError
+from scenarios.benchmarks.navigation_sets import NavigationSet, SetConfig, make_set
+from scenarios.commands.locate import command
+
+CONFIG = SetConfig(extent_m=2000.0, duration_s=420.0)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> NavigationSet:
+    return make_set(CONFIG, np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def files(drawn: NavigationSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("set")
+    write_map(folder / "prior.tif", drawn.prior)
+    pd.DataFrame(drawn.nav).to_csv(folder / "nav.csv", index=False)
+    return folder
+
+
+def locate(*arguments: object, text: str | None = None) -> Result:
+    return CliRunner().invoke(command, [str(a) for a in arguments], input=text)
+
+
+def test_a_set_is_navigated_and_every_row_answered(
+    files: Path, drawn: NavigationSet, tmp_path: Path
+) -> None:
+    result = locate("--map", files / "prior.tif", "--nav", files / "nav.csv", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    track = pd.read_csv(tmp_path / "trajectory.csv")
+    assert len(track) == len(drawn.nav["time_s"])
+    for name in ("sigma_easting_m", "cov_en_m2", "status", "protection_m", "time", "time_s"):
+        assert name in track
+    error = np.hypot(
+        track.easting_m - drawn.truth_easting_m, track.northing_m - drawn.truth_northing_m
+    )
+    assert error[70:].max() < 5.0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["converged"] is True
+    assert metrics["seed"] == 0
+    for name in ("trajectory-smoothed.csv", "fixes.csv", "locate.png", "config.toml"):
+        assert (tmp_path / name).stat().st_size > 0
+
+
+def test_a_map_elsewhere_fails_with_both_extents(files: Path, tmp_path: Path) -> None:
+    nav = pd.read_csv(files / "nav.csv")
+    nav.easting_m += 400_000
+    nav.to_csv(tmp_path / "nav.csv", index=False)
+    result = locate(
+        "--map", files / "prior.tif", "--nav", tmp_path / "nav.csv", "--out", tmp_path / "out"
+    )
+    assert isinstance(result.exception, NoOverlapError)
+    assert "does not meet the prior map" in str(result.exception)
+    assert not (tmp_path / "out" / "trajectory.csv").exists()
+
+
+def test_a_map_without_sigma_is_used_with_one_that_is_told(files: Path, tmp_path: Path) -> None:
+    grid = make_set(CONFIG, np.random.default_rng(1)).prior
+    bare = Grid(grid.elevation_m, grid.west_m, grid.north_m, grid.cell_m, grid.crs)
+    write_map(tmp_path / "bare.tif", bare)
+    result = locate(
+        "--map", tmp_path / "bare.tif", "--nav", files / "nav.csv", "--out", tmp_path / "out"
+    )
+    assert result.exit_code == 0, result.output
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert "S-44" in metrics["map_sigma_source"]
+
+
+def test_the_same_seed_gives_the_same_file(files: Path, tmp_path: Path) -> None:
+    texts = []
+    for name in ("a", "b"):
+        nav = pd.read_csv(files / "nav.csv").head(60)
+        nav.to_csv(tmp_path / "nav.csv", index=False)
+        locate(
+            "--map", files / "prior.tif", "--nav", tmp_path / "nav.csv", "--out", tmp_path / name
+        )
+        texts.append((tmp_path / name / "trajectory.csv").read_text())
+    assert texts[0] == texts[1]
+
+
+def test_following_writes_a_line_for_each_row(files: Path) -> None:
+    lines = (files / "nav.csv").read_text().splitlines()[:31]
+    result = locate("--follow", "--map", files / "prior.tif", text="\n".join(lines) + "\n")
+    assert result.exit_code == 0, result.output
+    told = [json.loads(line) for line in result.output.splitlines()]
+    assert len(told) == 30
+    assert told[-1]["time_s"] == 87.0
+
+
+def test_following_nothing_says_so(files: Path) -> None:
+    result = locate("--follow", "--map", files / "prior.tif", text="")
+    assert isinstance(result.exception, InputError)
+
+
+def test_observability_is_a_map_and_a_picture(tmp_path: Path) -> None:
+    from mapping.rasters import read_map
+
+    small = make_set(
+        SetConfig(extent_m=600.0, duration_s=30.0, outer_m=300.0), np.random.default_rng(2)
+    )
+    write_map(tmp_path / "prior.tif", small.prior)
+    result = locate("--observability", "--map", tmp_path / "prior.tif", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    layer = read_map(tmp_path / "out" / "observability.tif")
+    assert layer.shape == small.prior.shape
+    assert (tmp_path / "out" / "observability.png").exists()
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert 0.05 < metrics["sigma_best_median_m"] <= metrics["sigma_worst_median_m"] < 71.0
+
+
+@pytest.mark.parametrize(
+    "arguments", [(), ("--observability", "--follow"), ("--observability", "--nav", "x.csv")]
+)
+def test_wrong_usage_is_exit_two(files: Path, arguments: tuple[str, ...]) -> None:
+    result = locate("--map", files / "prior.tif", *arguments)
+    assert result.exit_code == 2
