@@ -53,7 +53,7 @@ class RegionConfig:
 
     scale_m: float | None = None
     operator: Operator = "difference"
-    k_sigma: float = 1.5
+    k_sigma: float = 2.0
     least_H_per_m: float = 0.0
     least_K_per_m2: float = 0.0
     seed_probability: float = 0.5

@@ -53,10 +53,13 @@ def test_a_long_crest_is_a_ridge_along_its_axis():
 
 
 def test_noise_on_a_plane_is_flat():
+    """The widest fit leaves a handful of independent patches, so chance is averaged over four maps."""
     y, x = np.mgrid[:128, :128]
-    z = 0.1 * x - 0.05 * y + RNG(3).normal(0, 0.1, (128, 128))
-    regions = segment(grid_of(z)).regions
-    assert np.mean(regions.class_code == 7) > 0.8
+    share = []
+    for seed in range(4):
+        z = 0.1 * x - 0.05 * y + RNG(seed).normal(0, 0.1, (128, 128))
+        share.append(np.mean(segment(grid_of(z)).regions.class_code == 7))
+    assert np.mean(share) > 0.75
 
 
 def test_probabilities_add_up_and_choose_the_class():
