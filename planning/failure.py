@@ -21,7 +21,11 @@ from planning.surface import BAR, BOTTOM, LOWER, WEIGHT, Surface
 # Price of a metre through barred ground: a detour of a hundred times a wall's thickness is taken first.
 _WALL_PRICE = 100.0
 # What the proof may add to a planned height (m) when a relaxation is named.
-_HAIR_M = 0.1
+_HAIR_M = 0.3
+# A breach (m^2) that touches a barred corner between samples, and is none.
+_TINY = 1e-3
+# So far above the ceiling that it limits nothing (m).
+_NO_CEILING_M = 1e4
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,11 +135,26 @@ def explain_limits(
         ),
         key=lambda c: c.breach,
     )
-    if surface.limits.turn_radius_m > 0 and straightened.breach == 0:
+    if surface.limits.turn_radius_m > 0 and straightened.breach < _TINY:
         return _turn_blocks(surface, straightened)
-    return _climb_blocks(
-        surface, straightened if straightened.breach < best.breach else best, problem
-    )
+    return _climb_blocks(surface, _least_lifted(surface, [*tries, best]), problem)
+
+
+def _least_lifted(surface: Surface, tries: list[Candidate]) -> Candidate:
+    """Return the plain path, every other limit kept, that needs the least ceiling."""
+    limits = surface.limits
+    open_top = replace(surface, limits=replace(limits, ceiling_m=limits.ceiling_m + _NO_CEILING_M))
+    lifted = []
+    # Skimming a wall's face needs less ceiling than crossing it, but a fresh plan need not find that path:
+    # what is named is what the plain way over needs.
+    for candidate in tries[:2]:
+        free = polish(open_top, candidate.points, sweeps=25, rounds=2, source=candidate.source)
+        if free.breach <= _TINY:
+            _, _, _, upper, z = _profile_along(surface, free.points)
+            lifted.append((float((z - upper).max()), free))
+    if not lifted:
+        return min(tries, key=lambda c: c.breach)
+    return min(lifted, key=lambda pair: pair[0])[1]
 
 
 def _profile_along(
@@ -229,7 +248,7 @@ def _turn_blocks(surface: Surface, candidate: Candidate) -> Blockage:
         middle = 0.5 * (low + high)
         eased = replace(surface, limits=replace(limits, turn_radius_m=middle))
         tried = polish(eased, opened.points, sweeps=30, rounds=1, fineness=2.0)
-        if tried.breach == 0:
+        if tried.breach < _TINY:
             low, opened = middle, tried
         else:
             high = middle

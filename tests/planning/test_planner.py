@@ -54,7 +54,9 @@ def test_a_straight_valley_is_followed_and_its_cost_is_its_length():
     assert np.abs(plan.route.easting_m - at(grid, 0, 80)[0]).max() < 0.5
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_rough_canyons_keep_every_limit_by_an_independent_check(seed):
     grid = grid_of(canyon(seed=seed))
     plan = plan_route(grid, at(grid, 6, 118), at(grid, 233, 121))
@@ -91,9 +93,9 @@ def test_a_mirrored_world_gives_a_route_of_the_same_cost():
 
 
 def test_the_same_seed_gives_the_same_route_to_the_bit():
-    grid = grid_of(canyon(n=160, seed=2))
+    grid = grid_of(canyon(n=120, seed=2))
     runs = [
-        plan_route(grid, at(grid, 6, 80), at(grid, 150, 80), config=PlanConfig(seed=3)).route
+        plan_route(grid, at(grid, 6, 60), at(grid, 112, 60), config=PlanConfig(seed=3)).route
         for _ in range(2)
     ]
     for name in ("easting_m", "northing_m", "depth_m"):

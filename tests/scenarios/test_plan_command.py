@@ -131,6 +131,33 @@ def test_replanning_starts_where_the_vehicle_is(chart, tmp_path):
     assert metrics["solved"] is True and metrics["length_m"] < 130
 
 
+def test_a_map_too_large_to_hold_is_planned_reduced_and_proved_in_full(tmp_path, monkeypatch):
+    row, col = np.mgrid[:400, :400]
+    z = -60.0 + 5.0 * np.sin(row / 60.0) * np.cos(col / 50.0) + 0.3 * np.sin(row * 1.7 + col)
+    grid = grid_of(z)
+    write_map(tmp_path / "map.tif", grid)
+    monkeypatch.setattr("planning.large.MOST_CELLS", 10_000)
+    monkeypatch.setattr("planning.large.REDUCED_CELLS", 10_000)
+    monkeypatch.setattr("planning.large._WINDOW_CELLS", 64.0)
+    result = run(
+        "--map", tmp_path / "map.tif", "--start", position(20.2, 30), "--goal", position(380, 361.3),
+        "--out", tmp_path / "o", "--region-weights", "none", "--planner", "none", "--no-picture",
+    )  # fmt: skip
+    assert result.exception is None, result.exception
+    metrics = json.loads((tmp_path / "o" / "metrics.json").read_text())
+    assert metrics["solved"] is True and metrics["reduced_cell_m"] == 4.0
+    with (tmp_path / "o" / "route.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    e, n, d = (np.array([float(r[c]) for r in rows]) for c in COLUMNS[:3])
+    v = np.linspace(0, 1, 21)
+    dense = [(a[:-1, None] + np.diff(a)[:, None] * v).ravel() for a in (e, n, d)]
+    # float32 in the file: compare with the heights as stored.
+    stored = grid_of(z.astype(np.float32))
+    altitude = -dense[2] - stored.sample(dense[0], dense[1])
+    assert altitude.min() >= 5.0
+    assert abs(altitude.min() - metrics["min_altitude_m"]) < 0.05
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [
