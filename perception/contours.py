@@ -34,6 +34,8 @@ class Roughness:
 
 # A floor at which the altimeter sees nothing still has ripples: 1 cm at 10 m.
 _LEAST_SCALE = 1e-5
+# Slopes beyond some 20 degrees over a third of the altitude are cliffs, which no variogram describes.
+_MOST_SLOPE_SQUARE = 0.15
 
 
 def level_lines(
@@ -102,7 +104,7 @@ def learn_roughness(
     top = min(max(reach_m, 4 * step), 0.5 * length)
     lags = np.unique(np.geomspace(1, max(2, top / step), 14).astype(int))
     lags = lags[lags < len(even)]
-    values = np.array([0.5 * np.mean(np.square(even[k:] - even[:-k])) for k in lags])
+    values = np.array([_half_square(even[k:] - even[:-k]) for k in lags])
     values = np.maximum(values - noise, 0.05 * values) + 1e-12
     counts = len(even) / lags
     # Far lags have few independent pairs; near ones are mostly noise.
@@ -113,6 +115,33 @@ def learn_roughness(
     power = float(np.clip(power, 0.2, 1.9))
     log_scale = float(np.average(np.log(values) - power * np.log(lags * step), weights=weights**2))
     return Roughness(max(float(np.exp(log_scale)), _LEAST_SCALE), power)
+
+
+def _half_square(differences: FloatArray) -> float:
+    """Return half the mean square of differences: the mean of a plain and of a robust estimate.
+
+    Few large differences are objects under the track, which the plain mean takes for rough floor, or the
+    one ridge of the pass, which the robust estimate (Cressie & Hawkins 1980, by square roots) leaves
+    out; the soundings alone do not tell which.
+    """
+    count = len(differences)
+    root = float(np.mean(np.sqrt(np.abs(differences))))
+    robust = 0.5 * root**4 / (0.457 + 0.494 / count)
+    return 0.5 * (robust + 0.5 * float(np.mean(np.square(differences))))
+
+
+def least_range_bias(altitude_m: FloatArray, roughness: Roughness) -> tuple[FloatArray, FloatArray]:
+    """Return how much the least slant range falls short of the altitude, and the 1-sigma of that.
+
+    A floor of slope s has its least range at ``altitude cos(s)``, short by about ``altitude s^2 / 2``. The
+    slopes across the track are not seen, but over a third of the altitude they are as large as those
+    along it, whose mean square the variogram gives: ``2 gamma(l) / l^2``. Both returned arrays have
+    the shape of `altitude_m` (metres).
+    """
+    lag = np.maximum(altitude_m / 3, 0.1)
+    slope_square = np.minimum(2 * roughness.variogram(lag) / lag**2, _MOST_SLOPE_SQUARE)
+    # The square of a normal slope has a standard deviation of sqrt(2) times its mean.
+    return 0.5 * altitude_m * slope_square, altitude_m * slope_square / np.sqrt(2)
 
 
 def floor_beside(

@@ -12,7 +12,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from perception.bottom import BottomConfig, BottomTrack, track_bottom
-from perception.contours import Roughness, floor_beside, learn_roughness, level_lines
+from perception.contours import (
+    Roughness,
+    floor_beside,
+    learn_roughness,
+    least_range_bias,
+    level_lines,
+)
 from perception.gain import Equalised, GainConfig, equalise
 from perception.geometry import ground_range, progress_along, resample_rows
 from perception.levels import SHADOW, LevelConfig, Levels, segment_levels
@@ -96,10 +102,13 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
     sounded = -(depth_m + bottom.altitude_m)
     reach = sample_m * port.shape[1]
     rough = learn_roughness(sounded, bottom.sigma_m, along_m, reach)
-    line_m, line_sigma = level_lines(sounded, bottom.sigma_m, along_m, rough)
+    short, short_sigma = least_range_bias(bottom.altitude_m, rough)
+    # Where the two sides' first returns differ, part of it was found already.
+    short = np.maximum(short - (bottom.altitude_m - bottom.first_return_m), 0.0)
+    line_m, line_sigma = level_lines(sounded - short, bottom.sigma_m, along_m, rough)
     # Where within its sample the first echo began is the same unknown on every line: averaging many does
     # not take it away.
-    line_sigma = np.hypot(line_sigma, 0.3 * sample_m)
+    line_sigma = np.sqrt(line_sigma**2 + (0.3 * sample_m) ** 2 + short_sigma**2)
     altitude_m = -depth_m - line_m
     level = BottomTrack(altitude_m, line_sigma, bottom.first_return_m, bottom.valid)
     track = Track(along_m, altitude_m, line_sigma, swath.easting_m, swath.northing_m,
