@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter
 
 from perception.objects import ObjectTable
 from perception.readers import open_survey
-from perception.records import FloatArray, Progress, Swath, silent
+from perception.records import BoolArray, FloatArray, Progress, Swath, silent
 from perception.shadows import hill_height
 from perception.strips import PassResult, build_strip
 from scenarios.benchmarks import Row, Table
@@ -30,8 +30,8 @@ class Truth:
     ping_row: FloatArray
     height_m: FloatArray
     radius_m: FloatArray
-    hill: FloatArray
-    measurable: FloatArray
+    hill: BoolArray
+    measurable: BoolArray
 
 
 def run(progress: Progress = silent) -> Table:
@@ -49,7 +49,7 @@ def _speed(progress: Progress) -> list[Row]:
     """Time conditioning, levels and strips on a floor with a shadow every 200 pings."""
     swath = _plain_swath(np.random.default_rng(1))
     build_strip(swath.take(slice(0, 200)))
-    rows = []
+    rows: list[Row] = []
     for method, work in (("bathynav", build_strip), ("threshold per ping", threshold_objects)):
         progress("speed", len(rows), 2)
         began = time.perf_counter()
@@ -100,7 +100,9 @@ def threshold_objects(swath: Swath) -> list[tuple[float, float, float]]:
         marks, count = connected(dark)
         sizes = np.bincount(marks.ravel(), minlength=count + 1)
         for number in np.flatnonzero(sizes[1:] >= 20) + 1:
-            rows, columns = np.nonzero(marks == number) if count < 200 else _members(marks, number)
+            rows, columns = (
+                np.nonzero(marks == number) if count < 200 else _members(marks, int(number))
+            )
             sample_m = float(swath.sample_m[0])
             start, end = columns.min() * sample_m, (columns.max() + 1) * sample_m
             row = int(np.median(rows))
