@@ -3,10 +3,6 @@
 The fourth difference along both axes has the response (2 sin f/2)^4 on each: relief of more than some ten
 cells leaves nothing in it, noise of one cell all of its power. Its median absolute value over blocks is
 not led by the few cells where relief is sharp.
-
-Rough ground has power at one cell too. It is told from noise by its growth: with every second cell left
-out, independent noise shows the same variance v, relief of fractal dimension 2.2 three times as much (and
-smoother relief more), so the noise is v_1 - (v_2 - v_1) / 2.
 """
 
 from __future__ import annotations
@@ -28,8 +24,6 @@ _NORM = np.sqrt(70.0)
 _BLOCK = 64
 # With fewer differences a block's median says little.
 _LEAST = 50
-# Growth of the difference's variance from spacing one to two on natural relief: 2^(2 h) with h = 0.8.
-_GROWTH = 3.0
 # A stated sigma above 1 / 0.8 of the scatter seen is not noise of single cells: such noise would show.
 _SEEN = 0.8
 
@@ -60,49 +54,38 @@ def independent_noise(z: FloatArray, sigma_m: FloatArray | None, step: int) -> F
 
 def _block_scatter(z: FloatArray) -> FloatArray:
     """Return the robust 1-sigma of independent noise per block, medians of 3 x 3 blocks; NaN unknown."""
-    near = _scatter_at(z, 1)
-    far = _scatter_at(z, 2) if max(z.shape) >= 9 else near
-    growth = np.where(np.isfinite(far), far**2 - near**2, 0.0) / (_GROWTH - 1)
-    # Independent noise shows no growth but by chance, and chance must not add to it.
-    return np.sqrt(np.maximum(near**2 - np.maximum(growth, 0.0), 0.0))
-
-
-def _scatter_at(z: FloatArray, spacing: int) -> FloatArray:
-    """Return the robust 1-sigma of the normed difference over cells `spacing` apart, per block."""
     values = np.ascontiguousarray(z)
     rows, cols = values.shape
-    reach = 4 * spacing + 1
-    down = _DIFFERENCE / _NORM if rows >= reach else np.array([1.0])
-    across = _DIFFERENCE / _NORM if cols >= reach else np.array([1.0])
+    down = _DIFFERENCE / _NORM if rows >= 5 else np.array([1.0])
+    across = _DIFFERENCE / _NORM if cols >= 5 else np.array([1.0])
     blocks = (-(-rows // _BLOCK), -(-cols // _BLOCK))
-    if rows < reach and cols < reach:
+    if rows < 5 and cols < 5:
         return np.full(blocks, np.nan)
     # A million differences tell as much as sixteen.
     stride = max(1, int(np.sqrt(values.size / 1e6)))
     scatter, count = np.empty(blocks), np.empty(blocks)
-    _scatter(values, down, across, spacing, stride, scatter, count)
+    _scatter(values, down, across, stride, scatter, count)
     scatter[count < min(_LEAST, 0.25 * values.size)] = np.nan
     return _median_of_neighbours(scatter)
 
 
 @njit(cache=True, parallel=True)
 def _scatter(
-    z: Array, down: Array, across: Array, spacing: int, stride: int, scatter: Array, count: Array
+    z: Array, down: Array, across: Array, stride: int, scatter: Array, count: Array
 ) -> None:
     rows, cols = z.shape
     ny, nx = len(down) // 2, len(across) // 2
-    py, px = ny * spacing, nx * spacing
     for bi in prange(scatter.shape[0]):
         found = np.empty(64 * 64)
         for bj in range(scatter.shape[1]):
             n = 0
-            for i in range(max(64 * bi, py), min(64 * bi + 64, rows - py), stride):
-                for j in range(max(64 * bj, px), min(64 * bj + 64, cols - px), stride):
+            for i in range(max(64 * bi, ny), min(64 * bi + 64, rows - ny), stride):
+                for j in range(max(64 * bj, nx), min(64 * bj + 64, cols - nx), stride):
                     total = 0.0
                     for k in range(-ny, ny + 1):
                         line = 0.0
                         for m in range(-nx, nx + 1):
-                            line += across[m + nx] * z[i + k * spacing, j + m * spacing]
+                            line += across[m + nx] * z[i + k, j + m]
                         total += down[k + ny] * line
                     if not np.isnan(total):
                         found[n] = abs(total)
