@@ -135,13 +135,18 @@ def explain_limits(
         ),
         key=lambda c: c.breach,
     )
+    lifted = _least_lifted(surface, tries)
     if surface.limits.turn_radius_m > 0 and straightened.breach < _TINY:
-        return _turn_blocks(surface, straightened)
-    return _climb_blocks(surface, _least_lifted(surface, [*tries, best]), problem)
+        turning = _turn_blocks(surface, straightened)
+        # A vehicle that turns on the spot can zigzag up any wall's face: where a ceiling would do as well,
+        # a radius far below the vehicle's is no way out.
+        if lifted is None or turning.opens["turn_radius_m"] >= 0.3 * surface.limits.turn_radius_m:
+            return turning
+    return _climb_blocks(surface, best if lifted is None else lifted, problem)
 
 
-def _least_lifted(surface: Surface, tries: list[Candidate]) -> Candidate:
-    """Return the plain path, every other limit kept, that needs the least ceiling."""
+def _least_lifted(surface: Surface, tries: list[Candidate]) -> Candidate | None:
+    """Return the plain path, every other limit kept, that needs the least ceiling; None without."""
     limits = surface.limits
     open_top = replace(surface, limits=replace(limits, ceiling_m=limits.ceiling_m + _NO_CEILING_M))
     lifted = []
@@ -152,9 +157,7 @@ def _least_lifted(surface: Surface, tries: list[Candidate]) -> Candidate:
         if free.breach <= _TINY:
             _, _, _, upper, z = _profile_along(surface, free.points)
             lifted.append((float((z - upper).max()), free))
-    if not lifted:
-        return min(tries, key=lambda c: c.breach)
-    return min(lifted, key=lambda pair: pair[0])[1]
+    return min(lifted, key=lambda pair: pair[0])[1] if lifted else None
 
 
 def _profile_along(

@@ -116,6 +116,9 @@ def plan_route(
     correlation = config.correlation_m
     if not np.isfinite(correlation):
         correlation = 10.0 * max(grid.cell_m, grid.cell_north_m)
+    if terms.position_per_m > 0 and position_sigma_m is not None:
+        dear = terms.position_per_m * np.nan_to_num(position_sigma_m)
+        weight = dear + (1.0 if weight is None else weight)
     submerged = not _dry(grid, start, goal)
     straight = float(np.hypot(goal[0] - start[0], goal[1] - start[1]))
     length = 1.3 * straight

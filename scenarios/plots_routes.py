@@ -69,7 +69,7 @@ def _picture_route(path: Path, plan: Plan, route: Route) -> None:
     lower.annotate(
         f"least margin {route.min_clearance_margin_m:.3f} m over {limits.floor_m:g} m"
         + (f" + {plan.k:.2f} sigma" if plan.k > 0 else ""),
-        (s[at], -route.worst[2]), xytext=(8, 14), textcoords="offset points", fontsize=7,
+        (s[at], -route.worst[2]), xytext=(0, 22), textcoords="offset points", fontsize=7, ha="right" if s[at] > 0.7 * s[-1] else "left",
     )  # fmt: skip
     _save(path, figure)
 
@@ -166,6 +166,7 @@ def _draw_map(axes: Any, surface: Surface, box: tuple[int, ...]) -> None:
     axes.set_ylabel("northing (m)")
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.tick_params(labelsize=7)
+    axes.locator_params(nbins=6)
 
 
 def _draw_profile(
