@@ -80,7 +80,7 @@ def _grid_of(source: Any, path: Path, sigma_m: float | None) -> Grid:
     if sigma_m is not None:
         sigma = np.where(np.isfinite(elevation_m), float(sigma_m), np.nan)
     elif sigma_band is not None:
-        sigma = _read_band(source, sigma_band)
+        sigma = _known(_read_band(source, sigma_band))
     count_band = _band_named(descriptions, ("count",))
     transform = source.transform
     return Grid(
@@ -91,9 +91,14 @@ def _grid_of(source: Any, path: Path, sigma_m: float | None) -> Grid:
         cell_height_m=None if np.isclose(transform.a, -transform.e, rtol=1e-9) else -transform.e,
         crs=source.crs.to_string() if source.crs else "",
         sigma_m=sigma,
-        count=None if count_band is None else _read_band(source, count_band),
+        count=None if count_band is None else _known(_read_band(source, count_band)),
         datum=source.tags().get("VERTICAL_DATUM", ""),
     )
+
+
+def _known(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:
+    """Return a band, or None where it is there in name only: some makers leave uncertainty empty."""
+    return values if np.isfinite(values).any() else None
 
 
 def _refuse_unusable_frame(source: Any, path: Path) -> None:
@@ -107,9 +112,15 @@ def _refuse_unusable_frame(source: Any, path: Path) -> None:
             f"{path}: its rows do not run north to south (transform {tuple(transform)[:6]}); "
             "warp it to a north-up grid: gdalwarp -t_srs EPSG:<UTM zone> in.tif out.tif"
         )
-    if source.crs is not None and source.crs.is_geographic:
+    degrees = any(
+        key.endswith("#units") and str(value).lower().startswith("degree")
+        for key, value in source.tags().items()
+    )
+    # A NetCDF of the COARDS kind names no CRS; its axes' units tell.
+    if degrees or (source.crs is not None and source.crs.is_geographic):
+        name = source.crs.to_string() if source.crs is not None else "longitude and latitude"
         raise InputError(
-            f"{path}: its cells are in degrees ({source.crs.to_string()}); "
+            f"{path}: its cells are in degrees ({name}); "
             "warp it to metres: gdalwarp -t_srs EPSG:<UTM zone> in.tif out.tif"
         )
     # A local (engineering) CRS is neither geographic nor projected: GDAL knows no unit of it.

@@ -40,7 +40,8 @@ class SurveyConfig:
     rounds : most rounds of registering and solving.
     keyframe_m : way between keyframes; None a twelfth of the swath, a handful of metres.
     first_window_m, window_m : width of the compared squares in the first round and later; None derives
-        them from the swath's width: large squares are hard to mistake, small ones bend with the drift.
+        them from the swath's width, narrower from round to round: large squares are hard to mistake, small
+        ones bend less with the drift.
     widest_search_m : no shift beyond this is looked for.
     settled_m : the loop ends when the corrections' rms change is below this; None a fifth of a cell.
     """
@@ -158,8 +159,8 @@ def correct_survey(
         )
         logger.info("round %d: %s", number + 1, rounds[-1])
         solution = after
-        # The first round's squares are coarse by intent: the second always pays.
-        if number and (moved_m < settled_m or not rounds[-1].used):
+        # The first rounds' squares are coarse by intent: the third always pays.
+        if number > 1 and (moved_m < settled_m or not rounds[-1].used):
             break
     return _result(strips, keyframes, solution, found, rounds, config)
 
@@ -210,7 +211,7 @@ def _window_side(strips: Sequence[ElevationStrip], config: SurveyConfig, number:
     width = _swath_width(strips)
     if number == 0:
         return config.first_window_m or 0.8 * width
-    return config.window_m or 0.6 * width
+    return config.window_m or (0.6 if number == 1 else 0.42) * width
 
 
 def _round(

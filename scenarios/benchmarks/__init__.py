@@ -13,6 +13,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "experiments": ("experiments", "the experiment runner: overhead, memory, sameness"),
     "sonar-files": ("sonar_files", "reading sonar files: pings a second, memory at 1x and 10x"),
     "echoes": ("echoes", "echoes to strips: pings a minute, heights of objects against truth"),
+    "mapping": ("mapping", "one map from many passes: registration, pose graph, gridding, peers"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
     "navigation": (
         "navigation",
