@@ -32,10 +32,11 @@ _COLOURED, _COLOURED_AND_LARGE = 0.35, 1.35
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether the filter is healthy, and if not why."""
+    """Whether the filter is healthy, and if not why; `grave` where nothing can speak for it."""
 
     healthy: bool
     reason: str = ""
+    grave: bool = True
 
 
 class HealthMonitor:
@@ -59,6 +60,11 @@ class HealthMonitor:
         row[fit.beam] = fit.normalised
         self.normalised.append(row)
 
+    def size(self) -> float:
+        """Mean square of recent normalised innovations, wild ones counted at the gate."""
+        recent = np.array(self.normalised)[-2 * _SHORT :]
+        return float(np.nanmean(np.minimum(recent**2, 16.0))) if np.isfinite(recent).any() else 0.0
+
     def verdict(self) -> Verdict:
         """Judge the windows."""
         if len(self.normalised) < _SHORT // 2:
@@ -81,7 +87,9 @@ class HealthMonitor:
             return Verdict(False, f"innovations are {math.sqrt(size):.2f} times their claimed size")
         if size > _COLOURED_AND_LARGE and colour > _COLOURED:
             return Verdict(
-                False, f"innovations repeat (autocorrelation {colour:.2f}) as over wrong ground"
+                False,
+                f"innovations repeat (autocorrelation {colour:.2f}) as over wrong ground",
+                grave=False,
             )
         return Verdict(True)
 

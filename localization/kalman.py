@@ -21,6 +21,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from localization.likelihood import DEFAULT_LENGTH_M, GATE
+from localization.measurements import Soundings
 from localization.terrain import TerrainMap
 from localization.view import DEPTH, EAST, NORTH, SCALE, TURN, View
 from perception.records import BoolArray, FloatArray, IntArray
@@ -28,7 +29,7 @@ from perception.records import BoolArray, FloatArray, IntArray
 # Random walks of dead reckoning to choose among, m per square root of an hour, and their prior
 # weights: from errors that are constant, as nav.csv's defaults have them, to a vehicle that slips or
 # drifts with unmeasured currents.
-_WALKS_M_SQRT_H = {0.1: 0.65, 0.7: 0.15, 3.0: 0.1, 12.0: 0.1}
+_WALKS_M_SQRT_H = {0.1: 0.6, 0.7: 0.15, 4.0: 0.1, 25.0: 0.15}
 # Correlation lengths to choose among beside the split that the map's spectrum suggests.
 _LENGTHS_M = (30.0, 150.0)
 _USUAL_WALK_M_SQRT_H = 0.7
@@ -109,16 +110,18 @@ class TerrainKalman:
         hypothesis: Hypothesis,
         mean: FloatArray,
         covariance: FloatArray,
-        beams: int,
+        apart_m: FloatArray,
     ) -> None:
         self.assumed = hypothesis
+        beams = len(apart_m)
         self.beams = beams if beams <= _MOST_BEAMS else 0
         size = 5 + self.beams
         self.filter = ExtendedKalmanFilter(dim_x=size, dim_z=1)
         self.filter.x = np.concatenate([mean, np.zeros(self.beams)])
         self.filter.P = np.zeros((size, size))
         self.filter.P[:5, :5] = covariance
-        self.filter.P[5:, 5:] = hypothesis.shared_m**2 * np.eye(self.beams)
+        if self.beams:
+            self.filter.P[5:, 5:] = hypothesis.shared_m**2 * np.exp(-apart_m / hypothesis.length_m)
 
     def take(self, x: FloatArray, p: FloatArray) -> None:
         """Take another state and covariance, all components."""
@@ -136,8 +139,10 @@ class TerrainKalman:
         p: FloatArray = self.filter.P[:5, :5]
         return p
 
-    def predict(self, step_e: float, step_n: float, seconds: float, tide_m2: float) -> None:
-        """Carry the state over a dead-reckoned step."""
+    def predict(
+        self, step_e: float, step_n: float, seconds: float, tide_m2: float, apart_m: FloatArray
+    ) -> None:
+        """Carry the state over a dead-reckoned step; `apart_m` (beams, beams) is between footprints."""
         size = 5 + self.beams
         way = float(np.hypot(step_e, step_n))
         keep = np.exp(-way / self.assumed.length_m)
@@ -150,7 +155,10 @@ class TerrainKalman:
         q[TURN, TURN] = _TURN_PER_WALK**2 * self.assumed.walk_m2_s * seconds
         q[SCALE, SCALE] = _SCALE_PER_WALK**2 * self.assumed.walk_m2_s * seconds
         q[DEPTH, DEPTH] = tide_m2
-        q[5:, 5:] = (1 - keep**2) * self.assumed.shared_m**2 * np.eye(self.beams)
+        if self.beams:
+            # Beams side by side share the map's error as successive pings do.
+            alike = np.exp(-apart_m / self.assumed.length_m)
+            q[5:, 5:] = (1 - keep**2) * self.assumed.shared_m**2 * alike
         self.filter.F, self.filter.Q = f, q
         self.filter.predict()
 
@@ -223,19 +231,28 @@ class KalmanBank:
     ) -> None:
         self.assumed = hypotheses(terrain, walk_m_sqrt_h)
         self.tide_m2_s = tide_m_sqrt_h**2 / 3600.0
-        self.beams = beams
+        # Distances between the beams' footprints as last seen; far apart until then.
+        self.apart_m: FloatArray = np.where(np.eye(beams) > 0, 0.0, 1e6)
         self.filters: list[TerrainKalman] = []
         self.log_weight: FloatArray = np.zeros(0)
 
+    def see(self, soundings: Soundings) -> None:
+        """Take notice of how far apart the beams strike."""
+        beam = soundings.beam
+        self.apart_m[np.ix_(beam, beam)] = np.hypot(
+            soundings.east_m[:, None] - soundings.east_m,
+            soundings.north_m[:, None] - soundings.north_m,
+        )
+
     def start(self, mean: FloatArray, covariance: FloatArray) -> None:
         """Begin tracking from a Gaussian of (east, north, turn, scale, depth bias)."""
-        self.filters = [TerrainKalman(h, mean, covariance, self.beams) for h in self.assumed]
+        self.filters = [TerrainKalman(h, mean, covariance, self.apart_m) for h in self.assumed]
         self.log_weight = np.log([h.weight for h in self.assumed])
 
     def predict(self, step_e: float, step_n: float, seconds: float, slip_m2: float = 0.0) -> None:
         """Carry every filter over a dead-reckoned step; `slip_m2` is variance beyond the walk."""
         for f in self.filters:
-            f.predict(step_e, step_n, seconds, self.tide_m2_s * seconds)
+            f.predict(step_e, step_n, seconds, self.tide_m2_s * seconds, self.apart_m)
             f.filter.P[:2, :2] += slip_m2 * np.eye(2)
 
     def shift(self, jump: FloatArray) -> None:

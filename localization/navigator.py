@@ -44,6 +44,10 @@ _MOST_EVIDENCE, _LEAST_EVIDENCE, _REFUTED, _ALLOWANCE = 30.0, -6.0, 15.0, 0.1
 _SILENT_S = 15.0
 # A step longer than this, and faster than both speeds below, is a reset of dead reckoning.
 _LEAST_JUMP_M, _SLOW_M_S, _FASTER = 10.0, 5.0, 5.0
+# Evidence at which a proved match is believed although its innovations repeat.
+_VOUCHED = 10.0
+# Mean square of recent innovations, 1 if the match claims right, above which a proved one may fail.
+_STRAINED = 1.6
 # What may have gone wrong unseen since the last trusted state, an axis.
 _LOST_M = 10.0
 # Speed error assumed while the navigation itself gives no position.
@@ -255,6 +259,7 @@ class Navigator:
     # ---- matching ------------------------------------------------------------------------------
 
     def _match(self, m: Measurement, soundings: Soundings) -> str:
+        self.bank.see(soundings)
         if self.tracking:
             return self._track(m, soundings)
         tide = self.sensors.tide_m_sqrt_h**2 / 3600.0 * 3.0
@@ -309,11 +314,17 @@ class Navigator:
             return f"depth stepped by {fit.common_step_m:+.1f} m; depth bias set free"
         self.health.add(fit, len(self.sensors.beams))
         verdict = self.health.verdict()
-        if not verdict.healthy:
+        # Coloured innovations of a map that explains the soundings far better than memory does are
+        # the map's own unmodelled error, not a wrong place.
+        vouched = self.converged_once and self.evidence > _VOUCHED
+        if not verdict.healthy and (verdict.grave or not vouched):
             return self._lose(verdict.reason)
         self.evidence = min(max(self.evidence + gained, _LEAST_EVIDENCE), _MOST_EVIDENCE)
         self.against = min(self.against + gained + _ALLOWANCE, 0.0)
-        if self.against < -_REFUTED:
+        # A proved match is not given up for free ground's sake alone: where the map is coarse beside
+        # the soundings' spacing, memory predicts better than the best map, and nothing is wrong.
+        strained = not self.converged_once or self.health.size() > _STRAINED
+        if self.against < -_REFUTED and strained:
             return self._lose("free ground explains the soundings better than the map")
         self.proved += 1
         if self._is_proved() and _largest(covariance) < self.config.converged_m:
@@ -376,6 +387,7 @@ class Navigator:
         for i, (mean, covariance) in enumerate([self.reckoned, *self.trusted]):
             arrays[f"trusted_{i}_mean"], arrays[f"trusted_{i}_covariance"] = mean, covariance
         arrays["bank_weight"], arrays["velocity"] = self.bank.log_weight, self.velocity
+        arrays["apart"] = self.bank.apart_m
         arrays["rival"], arrays["seen"] = self.rival.known, np.array(sorted(self.seen_times))
         arrays["health"] = np.array(self.health.normalised).reshape(-1, len(self.sensors.beams))
         words = {name: getattr(self, name) for name in _PLAIN_STATE}
@@ -400,6 +412,7 @@ class Navigator:
             for i in range(words["trusted"] + 1)
         ]
         self.reckoned, self.trusted = trusted[0], trusted[1:]
+        self.bank.apart_m = np.asarray(arrays["apart"]).copy()
         if len(arrays["bank_weight"]):
             self.bank.start(*self.reckoned)
             for i, f in enumerate(self.bank.filters):
