@@ -261,7 +261,8 @@ def _measure(
         if fit is not None and fit.gain < config.min_gain:
             return None
     if fit is not None and _explains(fit, shadow, drop, track):
-        return _of_fit(fit, start_m, end_m, drop, drop_sigma, config)
+        pings = int((shadow.lengths >= 0.5 * shadow.lengths.max()).sum())
+        return _of_fit(fit, start_m, end_m, drop, drop_sigma, pings, config)
     return _of_shadow(shadow, order > 0, sample_m, start_m, end_m, drop, drop_sigma, track)
 
 
@@ -419,13 +420,21 @@ def _explains(fit: BumpFit, shadow: _Shadow, drop: float, track: Track) -> bool:
 
 
 def _of_fit(
-    fit: BumpFit, start_m: float, end_m: float, drop: float, drop_sigma: float, config: ObjectConfig
+    fit: BumpFit,
+    start_m: float,
+    end_m: float,
+    drop: float,
+    drop_sigma: float,
+    pings: int,
+    config: ObjectConfig,
 ) -> ObjectRow:
     x0, y0, _, log_sx, log_sy, log_beta, _ = fit.parameters
     height = fit.height_m
     beta = float(np.exp(log_beta))
     # Heights scale with the sonar's height above the floor; log A has the fit's own sigma.
     relative = np.sqrt(fit.covariance[2, 2] + config.shape_sigma**2 + (drop_sigma / drop) ** 2)
+    # The horizontal beam's spread, which the model has not, blurs what few pings see.
+    relative = np.hypot(relative, 0.25 / max(pings, 1))
     # Nearer than about the altitude the echo folds over itself and is dimmed by slope as much as by shadow:
     # in trials a fifth to a third of the height was off there.
     relative = np.hypot(relative, 0.4 * np.clip(1.3 - x0 / drop, 0.0, 0.8))

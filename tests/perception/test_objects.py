@@ -106,7 +106,8 @@ def test_forty_objects_meet_the_reach_and_their_sigma() -> None:
     assert np.median(np.abs(errors)) <= 0.05
     assert np.percentile(np.abs(errors), 90) <= 0.15
     assert np.mean(kinds) >= 0.98
-    assert 0.5 < np.mean(np.abs(scores) < 1) < 0.85
+    # Forty objects: +-7 % of chance. These pings have no beam spread, for which sigma makes room.
+    assert 0.5 < np.mean(np.abs(scores) < 1) < 0.9
 
 
 def test_the_model_of_the_fit_agrees_with_independent_facets() -> None:
