@@ -82,6 +82,7 @@ class SurveyMap:
     raw_track : the same poses as the file's own navigation had them.
     passes : strip, objects, bottom and shadows of each pass, as navigated.
     corrected : strips with corrected poses, and what the pose graph says of itself.
+    objects : every pass's objects at their corrected places, one table a pass.
     inversion : diagnostics of the joint method; None where the map is of shadows alone.
     """
 
@@ -90,6 +91,7 @@ class SurveyMap:
     raw_track: Trajectory
     passes: tuple[PassSummary, ...]
     corrected: CorrectedSurvey
+    objects: tuple[ObjectTable, ...]
     inversion: InversionResult | None
 
 
@@ -119,7 +121,7 @@ def map_survey(
 
         looks = [_look(survey, i, result, corrected, track) for i, result in enumerate(results)]
         inversion = invert(looks, cell_m, crs=survey.crs, progress=progress)
-        grid = inversion.grid
+        grid = with_pose_sigma(inversion.grid, track, corrected.height_sigma_m)
     else:
         grid = fuse(
             corrected.strips,
@@ -130,7 +132,8 @@ def map_survey(
             progress=progress,
         )
     grid = replace(grid, datum=survey.datum)
-    return SurveyMap(grid, track, navigated_track(survey), results, corrected, inversion)
+    objects = tuple(corrected_objects(p.objects, track) for p in results)
+    return SurveyMap(grid, track, navigated_track(survey), results, corrected, objects, inversion)
 
 
 # The last survey's passes: a mission's strips and map are two commands in one process, and the same
@@ -258,6 +261,34 @@ def corrected_swath(swath: Swath, track: Trajectory, height_offset_m: float) -> 
         heading_rad=track.heading_rad[swath.ping],
         depth_m=swath.depth_m - height_offset_m,
     )
+
+
+def corrected_objects(table: ObjectTable, track: Trajectory) -> ObjectTable:
+    """Return objects at the places that the corrected poses of their pings give them."""
+    heading_rad = track.heading_rad[table.ping]
+    return replace(
+        table,
+        easting_m=track.easting_m[table.ping] + np.cos(heading_rad) * table.across_m,
+        northing_m=track.northing_m[table.ping] - np.sin(heading_rad) * table.across_m,
+    )
+
+
+def with_pose_sigma(grid: Grid, track: Trajectory, height_sigma_m: FloatArray) -> Grid:
+    """Add to a grid's sigma what the poses do not know: their place times slope, and their height.
+
+    The inversion takes its poses for true. Errors of pose are shared by all that a pass saw, so they are
+    not averaged over cells; over passes they are taken at their rms, as if all were one.
+    """
+    if grid.sigma_m is None:
+        return grid
+    used = np.ones(len(track.time_s), bool) if track.pass_index is None else track.pass_index >= 0
+    # Half of the trace: the slope has a direction, the error another.
+    place_m2 = 0.5 * np.nanmean((track.sigma_easting_m**2 + track.sigma_northing_m**2)[used])
+    known = height_sigma_m[np.isfinite(height_sigma_m)]
+    height_m2 = float(np.mean(known**2)) if known.size else 0.0
+    down, across = np.gradient(grid.elevation_m, grid.cell_north_m, grid.cell_m)
+    slope2 = np.nan_to_num(down**2 + across**2)
+    return replace(grid, sigma_m=np.sqrt(grid.sigma_m**2 + slope2 * place_m2 + height_m2))
 
 
 def _look(

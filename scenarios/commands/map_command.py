@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from scenarios.commands.console import (
 
 if TYPE_CHECKING:
     from perception.readers import Survey
+    from perception.records import FloatArray, Grid
     from scenarios.survey_map import SurveyMap
 
 
@@ -75,7 +77,9 @@ def command(
         for warning in survey.warnings:
             click.echo(f"note: {warning}", err=True)
         result = map_survey(survey, fixes=absolute, cell_m=cell, method=method, progress=progress)
-        metrics = _write(out, survey, result, prior)
+        metrics = _write(out, survey, result)
+        if prior is not None:
+            metrics |= tie_to_prior(out, result.grid, prior)
     config = {
         "surveys": [str(p) for p in surveys], "cell_m": cell, "crs": survey.crs, "method": method,
         "prior": prior, "fixes": fixes, "install": install, "tide": tide,
@@ -89,8 +93,9 @@ def command(
         _tell(metrics, out)
 
 
-def _write(out: Path, survey: Survey, result: SurveyMap, prior: Path | None) -> dict[str, Any]:
+def _write(out: Path, survey: Survey, result: SurveyMap) -> dict[str, Any]:
     """Write the folder's files and return its metrics."""
+    from mapping.mosaic import echo_mosaic, write_mosaic
     from mapping.rasters import write_map
     from mapping.trajectories import write_trajectory
     from scenarios.plots_survey import plot_layer, plot_map
@@ -102,11 +107,42 @@ def _write(out: Path, survey: Survey, result: SurveyMap, prior: Path | None) -> 
     plot_map(out / "map.png", result.grid, result.raw_track, result.track)
     if result.grid.sigma_m is not None:
         plot_layer(out / "sigma.png", result.grid, result.grid.sigma_m, "1-sigma, m", "magma")
-    return _metrics(survey, result)
+    mosaic = echo_mosaic(result.corrected.strips, result.grid.cell_m, survey.crs)
+    write_mosaic(out / "mosaic.tif", mosaic)
+    plot_layer(out / "mosaic.png", mosaic, mosaic.elevation_m, "echo over nominal, dB", "gray")
+    return _metrics(survey, result) | _write_objects(out, result)
+
+
+def _write_objects(out: Path, result: SurveyMap) -> dict[str, Any]:
+    """Write the objects of every pass, and those that several passes share as one."""
+    import numpy as np
+
+    from mapping.objects import merge_objects, write_objects
+    from perception.objects import ObjectTable, write_objects_csv
+
+    tables = result.objects
+    write_objects_csv(out / "objects.csv", ObjectTable.joined(list(tables)))
+    sigma_m = []
+    for summary in result.passes:
+        rows = summary.strip.ping
+        place_m2 = (
+            result.track.sigma_easting_m[rows] ** 2 + result.track.sigma_northing_m[rows] ** 2
+        )
+        # Between passes of one survey half a metre is what beam width and layover leave at least.
+        sigma_m.append(max(0.5, float(np.sqrt(0.5 * np.nanmean(place_m2)))))
+    merged = merge_objects(tables, sigma_m)
+    write_objects(out / "objects.gpkg", merged, result.grid.crs)
+    return {
+        "objects": sum(len(t) for t in tables),
+        "objects_merged": len(merged.height_m),
+        "objects_disputed": int(merged.disputed.sum()),
+    }
 
 
 def _metrics(survey: Survey, result: SurveyMap) -> dict[str, Any]:
     import numpy as np
+
+    from mapping.quality import survey_quality
 
     grid, said = result.grid, result.corrected.diagnostics
     seen = np.isfinite(grid.elevation_m)
@@ -115,7 +151,6 @@ def _metrics(survey: Survey, result: SurveyMap) -> dict[str, Any]:
         "pings": survey.n_pings,
         "pings_used": int((survey.pings.pass_index >= 0).sum()),
         "passes": survey.n_passes,
-        "objects": sum(len(p.objects) for p in result.passes),
         "cell_m": grid.cell_m,
         "cells": int(seen.sum()),
         "area_m2": float(seen.sum() * grid.cell_m * grid.cell_north_m),
@@ -131,7 +166,32 @@ def _metrics(survey: Survey, result: SurveyMap) -> dict[str, Any]:
         "largest_correction_m": said.largest_correction_m,
         "track_indeterminate": said.indeterminate,
         "track_worsened": said.worsened,
+        **survey_quality(result.corrected.strips, grid, result.track),
     }
+
+
+def tie_to_prior(out: Path, grid: Grid, prior: Path) -> dict[str, Any]:
+    """Shift the map's heights onto a prior map's, say by how much, and how the two still differ.
+
+    The shift is the median difference: tide and depth bias are common to a survey, changes of the
+    floor are not.
+    """
+    from mapping.compare import difference, write_changes
+    from mapping.rasters import read_map, write_map
+
+    old = read_map(prior)
+    shift_m = _prior_shift(difference(grid, old).grid.elevation_m)
+    tied = replace(grid, elevation_m=grid.elevation_m + shift_m, datum=old.datum or grid.datum)
+    left = difference(tied, old)
+    write_map(out / "map.tif", tied)
+    write_changes(out / "prior-changes.gpkg", left)
+    return {"prior_shift_m": shift_m} | {f"prior_{k}": v for k, v in left.statistics.items()}
+
+
+def _prior_shift(difference_m: FloatArray) -> float:
+    import numpy as np
+
+    return float(np.nanmedian(difference_m))
 
 
 def _write_soundings(path: Path, result: SurveyMap) -> None:
