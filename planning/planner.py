@@ -176,15 +176,20 @@ def _plan_on(
         )  # fmt: skip
     guide = np.column_stack([nodes[:, 1] * surface.cell_m[0], nodes[:, 0] * surface.cell_m[1]])
     guide = np.concatenate([ends[:1], guide[1:-1], ends[1:]])
-    candidates = _from_guides(surface, guide, ends, config)
+    # Barred ground a cell wider while looking: samples cannot miss its corners then.
+    careful = cautious(surface, ends) if surface.barred.any() else surface
+    candidates = _from_guides(careful, guide, ends, config)
+    if careful is not surface and all(c.breach > 0 for c in candidates):
+        careful = surface
+        candidates += _from_guides(careful, guide, ends, config)
     lap("guides_s")
     if config.planner != "none":
-        found = _ompl(surface, min(candidates, key=_merit), ends, config)
+        found = _ompl(careful, min(candidates, key=_merit), ends, config)
         if found is not None:
-            candidates.append(_polished(surface, found, "ompl"))
+            candidates.append(_polished(careful, found, "ompl"))
         lap("ompl_s")
     best = min(candidates, key=_merit)
-    candidates.append(polish(surface, best.points, _SWEEPS, rounds=2, source="final"))
+    candidates.append(polish(careful, best.points, _SWEEPS, rounds=2, source="final"))
     lap("polish_s")
     route, problem = _best_proved(surface, candidates, grid.crs)
     if route is None:
