@@ -15,6 +15,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "echoes": ("echoes", "echoes to strips: pings a minute, heights of objects against truth"),
     "mapping": ("mapping", "one map from many passes: registration, pose graph, gridding, peers"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
+    "navigation-montecarlo": ("navigation_montecarlo", "False fixes over terrains, drawn errors."),
     "navigation": (
         "navigation",
         "Position from terrain: error, bound, honesty, time per update, peers.",
