@@ -17,7 +17,15 @@ from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixe
 from mapping.overlaps import Window, find_overlaps
 from mapping.pose_graph import GraphConfig, Link, Solution, perpendicular, solve
 from mapping.registration import Match, match
-from mapping.textures import MatchConfig, Texture, default_cell, texture
+from mapping.textures import (
+    HEIGHT,
+    MatchConfig,
+    Texture,
+    default_cell,
+    placed_anew,
+    texture,
+    thinned,
+)
 from perception.records import (
     ElevationStrip,
     FloatArray,
@@ -137,13 +145,24 @@ def correct_survey(
     cell_m = config.match.cell_m or default_cell(strips)
     settled_m = config.settled_m or 0.2 * cell_m
     solution = solve(keyframes, (), ties, config.graph)
+    thin = [thinned(strip, 0.6 * cell_m) for strip in strips]
+    textures: dict[int, Texture] = {}
     rounds: list[Round] = []
     found: list[Registration] = []
     for number in range(config.rounds):
-        corrected = _apply(strips, keyframes, solution)
+        corrected = _apply(thin, keyframes, solution)
         windows = find_overlaps(corrected, _window_side(strips, config, number))
         found, after = _round(
-            corrected, keyframes, ties, solution, windows, cell_m, config, progress, number
+            corrected,
+            textures,
+            keyframes,
+            ties,
+            solution,
+            windows,
+            cell_m,
+            config,
+            progress,
+            number,
         )
         moved = after.correction_m - solution.correction_m
         moved_m = float(np.sqrt((moved**2).sum(axis=1).mean()))
@@ -177,7 +196,9 @@ def known_floor(strips: Sequence[ElevationStrip]) -> Grid | None:
     cell_m = max(default_fusion_cell(strips), altitude / 6.0)
     grid = fuse(strips, cell_m)
     weight = np.where(
-        np.isfinite(grid.elevation_m), 1.0 / np.nan_to_num(np.asarray(grid.sigma_m), nan=1.0) ** 2, 0
+        np.isfinite(grid.elevation_m),
+        1.0 / np.nan_to_num(np.asarray(grid.sigma_m), nan=1.0) ** 2,
+        0,
     )
     width = 0.4 * altitude / cell_m
     total = gaussian_filter(weight, width)
@@ -216,6 +237,7 @@ def _window_side(strips: Sequence[ElevationStrip], config: SurveyConfig, number:
 
 def _round(
     corrected: Sequence[ElevationStrip],
+    known: dict[int, Texture],
     keyframes: Keyframes,
     ties: Sequence[KeyframeFix],
     solution: Solution,
@@ -233,7 +255,12 @@ def _round(
     for done, window in enumerate(windows, start=1):
         for index in (window.first, window.second):
             if index not in textures:
-                textures[index] = texture(corrected[index], config.match, floor)
+                if index not in known:
+                    known[index] = texture(corrected[index], config.match)
+                    raw_m = known[index].values[..., HEIGHT]
+                    # Heights as the strip has them: offsets are counted from there in every round.
+                    raw_m -= np.where(raw_m != 0, np.float32(solution.height_m[index]), 0)
+                textures[index] = placed_anew(known[index], corrected[index], floor)
         ends = [
             keyframes.nearest(s, line)
             for s, line in ((window.first, window.first_line), (window.second, window.second_line))
@@ -316,7 +343,6 @@ def _link(
         ground.append(solution.correction_m[k] + swing)
     # The mean of a random walk over the window against its value in the middle: q^2 L / 12, each pass.
     bend = 2.0 * config.drift_m_per_sqrt_km**2 / 1000.0 * window.side_m / 12.0
-    heights = solution.height_m[[int(keyframes.strip[k]) for k in ends]]
     return Link(
         first=ends[0],
         second=ends[1],
@@ -324,7 +350,7 @@ def _link(
         second_offset_m=offsets[1],
         shift_m=ground[1] - ground[0] - result.shift_m,
         covariance_m2=result.covariance_m2 + bend * np.eye(2),
-        height_m=float(heights[1] - heights[0] - result.height_m),
+        height_m=-float(result.height_m),
         height_sigma_m=float(result.height_sigma_m),
     )
 

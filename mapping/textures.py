@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -105,6 +105,41 @@ def texture(
     weights[..., OBJECTS] = np.isfinite(strip.echo)
     values[weights == 0] = 0.0
     return Texture(values, weights, strip, relief_share, placed_across(strip, floor))
+
+
+def placed_anew(known: Texture, strip: ElevationStrip, floor: Grid | None) -> Texture:
+    """Return a texture at the strip's new poses and placed on a better known floor; its values stay."""
+    return replace(known, strip=strip, across_m=placed_across(strip, floor))
+
+
+def thinned(strip: ElevationStrip, width_m: float) -> ElevationStrip:
+    """Return the strip with columns averaged to no more than `width_m` each.
+
+    Power and heights are means of what is there, sigma likewise (columns err together), shadow the majority.
+    The sides are not mixed: columns are counted from the track outwards.
+    """
+    _, spacing = _spacings(strip) if len(strip.time_s) > 1 and len(strip.across_m) > 1 else (0, 1e9)
+    factor = int(width_m / spacing)
+    if factor < 2:
+        return strip
+    block = np.floor(np.arange(len(strip.across_m)) - int((strip.across_m < 0).sum())) // factor
+    first = np.flatnonzero(np.diff(block, prepend=block[0] - 1))
+    size = np.diff(np.append(first, len(block)))
+
+    def mean(values: FloatArray) -> FloatArray:
+        seen = np.isfinite(values)
+        number = np.add.reduceat(seen.astype(np.float32), first, axis=1)
+        total = np.add.reduceat(np.where(seen, values, 0.0), first, axis=1)
+        return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+    return replace(
+        strip,
+        elevation_m=mean(strip.elevation_m),
+        sigma_m=mean(strip.sigma_m),
+        echo=mean(strip.echo),
+        shadow=np.add.reduceat(strip.shadow.astype(np.float32), first, axis=1) > 0.5 * size,
+        across_m=np.add.reduceat(strip.across_m, first) / size,
+    )
 
 
 def placed_across(strip: ElevationStrip, floor: Grid | None) -> FloatArray:
