@@ -16,7 +16,7 @@ from planning.corridor import make_corridor
 from planning.cost import CostTerms
 from planning.curve import waypoints
 from planning.failure import Blockage, explain_barrier, explain_limits
-from planning.finish import exact_cost, finish
+from planning.finish import POSITION_DIGITS, exact_cost, finish
 from planning.layers import cost_to_go, layered_path, thinned
 from planning.limits import VehicleLimits
 from planning.polish import RADIUS_RESERVE, Candidate, control_spacing, polish, smooth_guide
@@ -81,6 +81,13 @@ class Plan:
     def solved(self) -> bool:
         return self.route is not None
 
+    @property
+    def ratio(self) -> float:
+        """Cost over the limit-free grid search; NaN without a route or between ends of one cell."""
+        if self.route is None or not self.grid_cost > 0:
+            return math.nan
+        return self.route.cost / self.grid_cost
+
 
 def plan_route(
     grid: Grid,
@@ -121,6 +128,10 @@ def plan_route(
         weight = dear + (1.0 if weight is None else weight)
     submerged = not _dry(grid, start, goal)
     straight = float(np.hypot(goal[0] - start[0], goal[1] - start[1]))
+    if straight < 10.0**-POSITION_DIGITS:
+        raise InputError(
+            f"start and goal are the same place ({start[0]:.2f},{start[1]:.2f}); move one of them"
+        )
     length = 1.3 * straight
     while True:
         patches = patches_crossed(length, correlation)

@@ -51,7 +51,7 @@ def _picture_route(path: Path, plan: Plan, route: Route) -> None:
     )
     upper.legend(loc="best", fontsize=7, framealpha=0.85)
     upper.set_title(
-        f"cost {route.cost:.0f} = {route.cost / plan.grid_cost:.3f} of the grid search; "
+        f"cost {route.cost:.0f} = {plan.ratio:.3f} of the grid search; "
         f"length {route.length_m:.0f} m, mean altitude {route.mean_altitude_m:.2f} m",
         fontsize=9,
     )

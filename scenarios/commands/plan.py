@@ -486,8 +486,10 @@ def _write_metrics(
         **_figures(route),
         "grid_cost": plan.grid_cost,
         "lower_bound": plan.lower_bound,
-        "cost_over_grid": None if route is None else route.cost / plan.grid_cost,
-        "gap_to_bound": None if route is None else route.cost / plan.lower_bound - 1.0,
+        "cost_over_grid": plan.ratio,
+        "gap_to_bound": None
+        if route is None or not plan.lower_bound > 0
+        else route.cost / plan.lower_bound - 1.0,
         "min_stand_off_m": stand_off,
         "solved": plan.solved,
         "reason": plan.reason,
@@ -531,7 +533,7 @@ def _tell(plan: Plan, seconds: float, out: Path) -> None:
         ("length", f"{route.length_m:.1f} m"),
         (
             "cost",
-            f"{route.cost:.1f} ({route.cost / plan.grid_cost:.3f} of the limit-free grid search)",
+            f"{route.cost:.1f} ({plan.ratio:.3f} of the limit-free grid search)",
         ),
         ("lower bound", f"{plan.lower_bound:.1f}"),
         ("altitude", f"mean {route.mean_altitude_m:.2f} m, least {route.min_altitude_m:.2f} m"),

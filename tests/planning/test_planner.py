@@ -222,3 +222,13 @@ def test_islands_of_no_data_are_gone_around():
 def test_a_floor_above_the_ceiling_is_refused():
     with pytest.raises(InputError, match=r"ceiling_m \(4\) must lie above floor_m \(5\)"):
         VehicleLimits(ceiling_m=4.0)
+
+
+def test_ends_in_one_place_are_refused_and_ends_in_one_cell_are_joined():
+    grid = grid_of(flat(40, 40))
+    with pytest.raises(InputError, match="same place"):
+        plan_route(grid, at(grid, 20, 20), at(grid, 20, 20), config=QUICK)
+    for config in (QUICK, PlanConfig()):
+        plan = plan_route(grid, at(grid, 20.1, 20), at(grid, 20.4, 20.2), config=config)
+        assert plan.route is not None, plan.reason
+        assert_allclose(plan.route.length_m, math.hypot(0.3, 0.2), rtol=1e-3)
