@@ -23,6 +23,9 @@ _OPTIONAL = ("pitch_deg", "roll_deg", "speed_m_s", "altitude_m")
 _DEEPEST_M = 12_000.0
 # No underwater vehicle makes 50 m/s: more is another unit, or another zone's positions.
 _FASTEST_M_S = 50.0
+# Navigation is logged every few seconds: ten minutes between rows of a vehicle that hardly moves is
+# another unit of time.
+_LONGEST_PAUSE_S = 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +203,12 @@ def check_nav(nav: NavTable) -> None:
         raise InputError(
             f"{nav.source}: positions move at {speed:.4g} m/s (median; the limit is "
             f"{_FASTEST_M_S:g}); are they in metres and time_s in seconds?"
+        )
+    pause = float(np.median(steps[forward]))
+    if pause > _LONGEST_PAUSE_S and speed < 0.05:
+        raise InputError(
+            f"{nav.source}: time_s advances by {pause:.4g} s a row (median) while positions move at "
+            f"{speed:.2g} m/s; is it in milliseconds?"
         )
     told = float(np.nanmedian(nav.speed_m_s)) if np.isfinite(nav.speed_m_s).any() else np.nan
     if told > 0.05 and speed > 0 and not 1 / 300 < speed / told < 300:

@@ -21,7 +21,7 @@ from mapping.fixes import write_fixes
 from mapping.rasters import read_map
 from mapping.trajectories import write_trajectory
 from perception.geodesy import convergence, is_local
-from perception.records import Grid, InputError, Progress
+from perception.records import Grid, InputError, NoOverlapError, Progress
 from scenarios.locating_swath import nav_of_survey, open_side_scan, patch_fixes
 
 logger = logging.getLogger(__name__)
@@ -65,7 +65,10 @@ def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, A
         nav = nav_of_survey(survey, sensors or Sensors())
     else:
         raise InputError("locate needs --nav NAV.csv, --swath SURVEY, or both")
-    terrain = terrain_map(prior, options.map_error_length_m, reach(nav))
+    try:
+        terrain = terrain_map(prior, options.map_error_length_m, reach(nav))
+    except NoOverlapError as error:
+        raise NoOverlapError(f"{nav.source} on {options.prior}: {error}") from error
     check_against_map(nav, float(np.nanmedian(terrain.height_m)))
     navigator = Navigator(
         terrain,

@@ -80,6 +80,13 @@ def test_time_in_milliseconds_is_refused_where_the_speed_tells() -> None:
         nav_table(columns)
 
 
+def test_time_in_milliseconds_is_refused_where_the_rows_tell() -> None:
+    columns = columns_of()
+    columns["time_s"] = columns["time_s"] * 1000
+    with pytest.raises(InputError, match="milliseconds"):
+        nav_table(columns)
+
+
 def test_kilometres_are_refused_against_the_map() -> None:
     columns = columns_of()
     for name in ("depth_m", "beam1_m", "beam2_m", "beam3_m", "beam4_m"):
