@@ -17,6 +17,7 @@ import numpy as np
 
 from localization.measurements import Measurement, Sensors
 from localization.navigator import Estimate, Navigator
+from localization.saved import bring_to, state_of
 from perception.files import whole_file
 from perception.records import InputError
 
@@ -115,7 +116,7 @@ def estimate_line(e: Estimate) -> str:
 
 def save_state(path: Path, navigator: Navigator) -> None:
     """Save a navigator so that `restore_state` goes on where it was."""
-    arrays, words = navigator.state()
+    arrays, words = state_of(navigator)
     with whole_file(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, words=np.array(json.dumps(words)), **arrays)  # type: ignore[arg-type]
 
@@ -132,7 +133,7 @@ def restore_state(path: Path, navigator: Navigator) -> None:
         with np.load(path, allow_pickle=False) as stored:
             words = json.loads(str(stored["words"]))
             arrays = {name: stored[name] for name in stored.files if name != "words"}
-        navigator.restore(arrays, words)
+        bring_to(navigator, arrays, words)
     except (OSError, ValueError, KeyError) as error:
         raise InputError(
             f"{path}: is not a saved state of this map and these sensors ({error})"

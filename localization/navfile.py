@@ -204,17 +204,17 @@ def check_nav(nav: NavTable) -> None:
             f"{nav.source}: positions move at {speed:.4g} m/s (median; the limit is "
             f"{_FASTEST_M_S:g}); are they in metres and time_s in seconds?"
         )
-    pause = float(np.median(steps[forward]))
-    if pause > _LONGEST_PAUSE_S and speed < 0.05:
-        raise InputError(
-            f"{nav.source}: time_s advances by {pause:.4g} s a row (median) while positions move at "
-            f"{speed:.2g} m/s; is it in milliseconds?"
-        )
     told = float(np.nanmedian(nav.speed_m_s)) if np.isfinite(nav.speed_m_s).any() else np.nan
     if told > 0.05 and speed > 0 and not 1 / 300 < speed / told < 300:
         raise InputError(
             f"{nav.source}: positions move at {speed:.4g} m/s (median) where speed_m_s says "
             f"{told:.4g}; is one of time_s, positions and speed_m_s in thousandths?"
+        )
+    pause = float(np.median(steps[forward]))
+    if pause > _LONGEST_PAUSE_S and speed < 0.05:
+        raise InputError(
+            f"{nav.source}: time_s advances by {pause:.4g} s a row (median) while positions move at "
+            f"{speed:.2g} m/s; is it in milliseconds?"
         )
 
 

@@ -12,16 +12,14 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from localization.integrity import HealthMonitor, protection_level, with_doubt
 from localization.kalman import KalmanBank
 from localization.measurements import Measurement, Sensors, Soundings, beam_vectors, soundings_of
-from localization.particles import Cloud, ParticleFilter
+from localization.particles import ParticleFilter
 from localization.rival import Evidence
 from localization.terrain import TerrainMap
 from localization.view import view_of
@@ -52,13 +50,6 @@ _STRAINED = 1.6
 _LOST_M = 10.0
 # Speed error assumed while the navigation itself gives no position.
 _BLIND_M_S = 0.5
-
-
-# Attributes of a navigator that are plain values: with its arrays, all its memory.
-_PLAIN_STATE = (
-    "tracking", "proved", "evidence", "against", "losses", "attempts", "converged_once",
-    "since_update_m", "heard_s",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,57 +365,6 @@ class Navigator:
         box = self.reckoned[1].copy()
         box[:2, :2] = growth * (box[:2, :2] + _LOST_M**2 * np.eye(2))
         return box
-
-    # ---- saving ----------------------------------------------------------------------------------
-
-    def state(self) -> tuple[dict[str, FloatArray], dict[str, Any]]:
-        """Return all that the next update depends on, as arrays and plain values."""
-        arrays: dict[str, FloatArray] = {
-            f"cloud_{k}": v for k, v in asdict(self.search.cloud).items()
-        }
-        for i, f in enumerate(self.bank.filters):
-            arrays[f"filter_{i}_x"], arrays[f"filter_{i}_p"] = f.filter.x, f.filter.P
-        for i, (mean, covariance) in enumerate([self.reckoned, *self.trusted]):
-            arrays[f"trusted_{i}_mean"], arrays[f"trusted_{i}_covariance"] = mean, covariance
-        arrays["bank_weight"], arrays["velocity"] = self.bank.log_weight, self.velocity
-        arrays["apart"] = self.bank.apart_m
-        arrays["rival"], arrays["seen"] = self.rival.known, np.array(sorted(self.seen_times))
-        arrays["health"] = np.array(self.health.normalised).reshape(-1, len(self.sensors.beams))
-        words = {name: getattr(self, name) for name in _PLAIN_STATE}
-        words["rng"] = self.search.rng.bit_generator.state
-        words["misses"] = self.rival.misses
-        words["trusted"] = len(self.trusted)
-        if self.last is not None:
-            last = {k: v for k, v in asdict(self.last).items() if k != "slant_range_m"}
-            words["last"], arrays["last_ranges"] = last, self.last.slant_range_m
-        return arrays, words
-
-    def restore(self, arrays: Mapping[str, FloatArray], words: Mapping[str, Any]) -> None:
-        """Take the state that `state` gave; map, sensors and configuration must be the same."""
-        self.search.cloud = Cloud(
-            **{k: arrays[f"cloud_{k}"].copy() for k in asdict(self.search.cloud)}
-        )
-        self.search.rng.bit_generator.state = words["rng"]
-        for name in _PLAIN_STATE:
-            setattr(self, name, words[name])
-        trusted = [
-            (arrays[f"trusted_{i}_mean"], arrays[f"trusted_{i}_covariance"])
-            for i in range(words["trusted"] + 1)
-        ]
-        self.reckoned, self.trusted = trusted[0], trusted[1:]
-        self.bank.apart_m = np.asarray(arrays["apart"]).copy()
-        if len(arrays["bank_weight"]):
-            self.bank.start(*self.reckoned)
-            for i, f in enumerate(self.bank.filters):
-                f.take(arrays[f"filter_{i}_x"], arrays[f"filter_{i}_p"])
-            self.bank.log_weight[:] = arrays["bank_weight"]
-        self.velocity = np.asarray(arrays["velocity"])
-        self.rival.known, self.rival.misses = arrays["rival"], words["misses"]
-        self.seen_times = set(arrays["seen"].tolist())
-        self.health.reset()
-        self.health.normalised.extend(arrays["health"])
-        if "last" in words:
-            self.last = Measurement(slant_range_m=arrays["last_ranges"], **words["last"])
 
     # ---- what is told --------------------------------------------------------------------------
 

@@ -1,0 +1,75 @@
+"""All that a navigator remembers, as arrays and plain values: saved, it can go on another day."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from localization.measurements import Measurement
+from localization.navigator import Navigator
+from localization.particles import Cloud
+from perception.records import FloatArray
+
+# Attributes of a navigator that are plain values: with its arrays, all its memory.
+_PLAIN_STATE = (
+    "tracking", "proved", "evidence", "against", "losses", "attempts", "converged_once",
+    "since_update_m", "heard_s",
+)  # fmt: skip
+
+
+def state_of(navigator: Navigator) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+    """Return all that the next update depends on, as arrays and plain values."""
+    arrays: dict[str, FloatArray] = {
+        f"cloud_{k}": v for k, v in asdict(navigator.search.cloud).items()
+    }
+    for i, f in enumerate(navigator.bank.filters):
+        arrays[f"filter_{i}_x"], arrays[f"filter_{i}_p"] = f.filter.x, f.filter.P
+    for i, (mean, covariance) in enumerate([navigator.reckoned, *navigator.trusted]):
+        arrays[f"trusted_{i}_mean"], arrays[f"trusted_{i}_covariance"] = mean, covariance
+    arrays["bank_weight"], arrays["velocity"] = navigator.bank.log_weight, navigator.velocity
+    arrays["apart"] = navigator.bank.apart_m
+    arrays["rival"], arrays["seen"] = navigator.rival.known, np.array(sorted(navigator.seen_times))
+    arrays["health"] = np.array(navigator.health.normalised).reshape(
+        -1, len(navigator.sensors.beams)
+    )
+    words = {name: getattr(navigator, name) for name in _PLAIN_STATE}
+    words["rng"] = navigator.search.rng.bit_generator.state
+    words["misses"] = navigator.rival.misses
+    words["trusted"] = len(navigator.trusted)
+    if navigator.last is not None:
+        last = {k: v for k, v in asdict(navigator.last).items() if k != "slant_range_m"}
+        words["last"], arrays["last_ranges"] = last, navigator.last.slant_range_m
+    return arrays, words
+
+
+def bring_to(
+    navigator: Navigator, arrays: Mapping[str, FloatArray], words: Mapping[str, Any]
+) -> None:
+    """Take the state that `state_of` gave; map, sensors and configuration must be the same."""
+    navigator.search.cloud = Cloud(
+        **{k: arrays[f"cloud_{k}"].copy() for k in asdict(navigator.search.cloud)}
+    )
+    navigator.search.rng.bit_generator.state = words["rng"]
+    for name in _PLAIN_STATE:
+        setattr(navigator, name, words[name])
+    trusted = [
+        (arrays[f"trusted_{i}_mean"], arrays[f"trusted_{i}_covariance"])
+        for i in range(words["trusted"] + 1)
+    ]
+    navigator.reckoned, navigator.trusted = trusted[0], trusted[1:]
+    navigator.bank.apart_m = np.asarray(arrays["apart"]).copy()
+    if len(arrays["bank_weight"]):
+        navigator.bank.start(*navigator.reckoned)
+        for i, f in enumerate(navigator.bank.filters):
+            f.take(arrays[f"filter_{i}_x"], arrays[f"filter_{i}_p"])
+        navigator.bank.log_weight[:] = arrays["bank_weight"]
+    navigator.velocity = np.asarray(arrays["velocity"])
+    navigator.rival.known, navigator.rival.misses = arrays["rival"], words["misses"]
+    navigator.seen_times = set(arrays["seen"].tolist())
+    navigator.health.reset()
+    navigator.health.normalised.extend(arrays["health"])
+    if "last" in words:
+        navigator.last = Measurement(slant_range_m=arrays["last_ranges"], **words["last"])
