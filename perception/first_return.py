@@ -92,7 +92,9 @@ def _mapping_error(
     )  # fmt: skip
     rows, cols = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
     beside = (np.abs(cols - side) * cell_m >= gap_m) & (not seen)
-    known = bilinear_rows(rows[beside], cols[beside], np.ones(int(beside.sum())), shape)
+    known = bilinear_rows(
+        rows[beside].astype(float), cols[beside].astype(float), np.ones(int(beside.sum())), shape
+    )
     slope = (np.diff(truth, axis=1)[1:] + np.diff(truth, axis=1)[:-1]) / (2 * cell_m)
     slope = slope + _SLOPE_SIGMA * rng.standard_normal(slope.shape)
     surface = np.zeros(shape)

@@ -12,17 +12,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
 
 from perception.first_return import first_return_lead
 from perception.gain_basis import GainBasis
-from perception.posterior import Problem, Spectrum, dual_features
-from perception.profiles import mean_profiles, one_sided
-from perception.rays import Look, Rays, Soundings, stack_rays, stack_soundings
-from perception.records import BoolArray, FloatArray, Grid, InputError, Progress, silent
+from perception.occlusion import dark_samples, shadow_equations
+from perception.posterior import Problem, Spectrum
+from perception.profiles import crossing, mean_profiles, one_sided
+from perception.rays import Look, Rays, Soundings, of_unit_level, stack_rays, stack_soundings
+from perception.records import BoolArray, FloatArray, Grid, InputError, IntArray, Progress, silent
 from perception.roughness import learn_roughness
 from perception.shading import Rows, trace
 from perception.soundings import (
@@ -31,6 +32,7 @@ from perception.soundings import (
     join,
     sounding_equations,
 )
+from perception.stencils import dual_features
 
 __all__ = ["InversionConfig", "InversionResult", "Look", "invert"]
 
@@ -51,17 +53,27 @@ class InversionConfig:
     sounding_sigma_m : added to the soundings' own sigma.
     nadir : part of the altitude within which echoes tell nothing of slope (specular, layover).
     samples : perturbed solutions drawn for sigma.
+    independent : part of the data that counts as independent when sigma is drawn; neighbouring data
+        share the model's errors (roughness below a cell, registration).
+    shadows : put start and end of each shadow on one ray, and leave dark samples out of the shading.
+    caution : weight, in units of the prior, that holds a step to the present surface from the second
+        on. What echoes decide converges all the same; what they cannot tell from gain moves little.
+    nodes_at_once : nodes beyond which the first steps are taken on wider cells.
     max_cells : nodes beyond which a cell that was not asked for is enlarged.
     """
 
-    iterations: int = 5
+    iterations: int = 6
     exponent: float = 2.0
     least_sigma: float = 0.2
     albedo_sigma: float = 0.35
     albedo_length_m: float = 4.0
     sounding_sigma_m: float = 0.05
     nadir: float = 0.35
-    samples: int = 12
+    samples: int = 8
+    independent: float = 0.3
+    shadows: bool = False
+    caution: float = 4.0
+    nodes_at_once: int = 250_000
     max_cells: int = 4_000_000
 
 
@@ -136,13 +148,26 @@ def invert(
     """
     config = config or InversionConfig()
     rng = rng or np.random.default_rng(0)
+    if not looks:
+        raise InputError("no pass to invert; give at least one")
     state = _prepare(looks, cell_m, config, rng)
-    total = config.iterations + 2
+    total = config.iterations + 3
     progress("joint inversion", 1, total)
-    problem, passed, rows = _iterate(state, progress, total, rng)
-    sigma = _posterior_sigma(problem, state, rng)
+    if state.surface.size > config.nodes_at_once:
+        # Large maps take their first steps on cells twice as wide, at a quarter of the cost.
+        coarse = _prepare(looks, 2 * state.cell_m, config, rng)
+        solved = _iterate(coarse, config.iterations - 1, progress, rng)
+        deviation, base_sigma = _spread(coarse, solved, rng)
+        _hand_down(coarse, state)
+        last = _iterate(state, 2, progress, rng)
+        deviation = _resample(deviation, coarse, state)
+        base_sigma = _resample(base_sigma, coarse, state)
+    else:
+        last = _iterate(state, config.iterations, progress, rng)
+        deviation, base_sigma = _spread(state, last, rng)
     progress("joint inversion", total, total)
-    return _result(state, sigma, passed, rows, crs or looks[0].swath.crs)
+    sigma = _honest_sigma(state, deviation, base_sigma)
+    return _result(state, sigma, last, crs or looks[0].swath.crs)
 
 
 def _prepare(
@@ -152,7 +177,12 @@ def _prepare(
     rng: np.random.Generator,
 ) -> _State:
     cell = cell_m or _natural_cell(looks)
-    rays = [ray for i, look in enumerate(looks) for ray in stack_rays(look, i, cell)]
+    rays = of_unit_level([ray for i, look in enumerate(looks) for ray in stack_rays(look, i, cell)])
+    if not rays:
+        raise InputError(
+            f"no pass has an echo to invert ({len(looks)} given, every usable sample is missing); "
+            "use --method shadow, or mend the bottom track or the quality flags"
+        )
     bottoms = [
         b
         for look in looks
@@ -227,8 +257,14 @@ def _albedo_prior(config: InversionConfig) -> Spectrum:
 
 def _sounding_surface(state: _State) -> FloatArray:
     equations = sounding_equations(
-        state.surface, state.west_m, state.south_m, state.cell_m, state.soundings, below=True,
-        lead_m=state.lead_m, lead_sigma_m=state.lead_sigma_m,
+        state.surface,
+        state.west_m,
+        state.south_m,
+        state.cell_m,
+        state.soundings,
+        below=True,
+        lead_m=state.lead_m,
+        lead_sigma_m=state.lead_sigma_m,
     )
     problem = _problem(state, None, equations)
     fields = (state.surface, state.albedo, state.gain)
@@ -244,11 +280,35 @@ class _Data:
     weight: FloatArray
     c_level: FloatArray
     value: FloatArray
-    knot: FloatArray
+    knot: IntArray
     share: FloatArray
 
 
-def _problem(state: _State, data: _Data | None, equations: Equations) -> Problem:
+# The solver stops at this part of the first residual, or after so many steps; what is left is taken
+# up by the next relinearisation.
+_TOLERANCE = 3e-3
+# The iteration ends when the residual does not fall below this part of the one before.
+_NO_BETTER = 0.97
+# Where looks from both sides cover some of the ground they settle the gain, and holding the rest to
+# profiles that soundings only extrapolate would spoil it.
+_MOSTLY_ONE_SIDED = 0.85
+_SOLVER_STEPS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """The last linear problem: data, equations without the held profiles, one-sided cells, rays."""
+
+    data: _Data
+    equations: Equations
+    single: BoolArray
+    passed: BoolArray
+
+
+def _problem(
+    state: _State, data: _Data | None, equations: Equations, caution: float = 0.0
+) -> Problem:
+    """Return the linear problem; `caution` is the weight of the present surface beside the prior."""
     none = np.zeros(0)
     return Problem(
         cell_m=state.cell_m,
@@ -265,33 +325,52 @@ def _problem(state: _State, data: _Data | None, equations: Equations) -> Problem
         rows=equations.matrix,
         row_weight=equations.weight,
         row_value=equations.value,
-        height=state.roughness,
+        height=_times(state.roughness, 1 + caution),
         albedo=state.albedo_prior,
-        mean_height=np.full(state.shape, state.mean_m),
+        mean_height=(state.mean_m + caution * state.surface) / (1 + caution),
     )
 
 
-def _iterate(
-    state: _State, progress: Progress, total: int, rng: np.random.Generator
-) -> tuple[Problem, BoolArray, Rows]:
+def _iterate(state: _State, steps: int, progress: Progress, rng: np.random.Generator) -> _Solved:
     """Relinearise and solve until the surface stands still."""
-    for k in range(state.config.iterations):
+    for k in range(len(state.step_m), len(state.step_m) + steps):
+        dark = _dark(state, first=k == 0)
         rows, passed = trace(
             state.surface, state.west_m, state.south_m, state.cell_m, state.rays,
-            state.config.exponent,
+            state.config.exponent, dark,
         )  # fmt: skip
         # On the soundings' surface nothing hides; what other passes see is known after a step.
-        if k in (0, 2):
+        if k in (0, 2) or state.lead_sigma_m == 0.0:
             _learn_lead(state, rows, rng)
         data = _linearise(state, rows, first=k == 0)
         equations = sounding_equations(
-            state.surface, state.west_m, state.south_m, state.cell_m, state.soundings,
-            lead_m=state.lead_m, lead_sigma_m=state.lead_sigma_m,
+            state.surface,
+            state.west_m,
+            state.south_m,
+            state.cell_m,
+            state.soundings,
+            lead_m=state.lead_m,
+            lead_sigma_m=state.lead_sigma_m,
         )
-        equations = both(equations, _held_profiles(state, rows))
-        problem = _problem(state, data, equations)
+        single = one_sided(rows, state.shape)
+        held = _held_profiles(state, single, passed)
+        if k > 0 and state.config.shadows:
+            equations = both(
+                equations,
+                shadow_equations(
+                    state.surface, state.west_m, state.south_m, state.cell_m, state.rays, dark
+                ),
+            )
+        caution = 0.0 if k == 0 else _caution(state, rows)
+        solved = _Solved(data, equations, single, passed)
+        if len(state.residual) > 2 and state.residual[-1] > _NO_BETTER * state.residual[-2]:
+            # Further steps would only follow what gain and surface can trade.
+            break
+        problem = _problem(state, data, both(equations, held), caution)
         fields = (state.surface, state.albedo, state.gain)
-        solution, used = problem.solve(fields, problem.right_side(), tolerance=1e-3, most=60)
+        solution, used = problem.solve(
+            fields, problem.right_side(), tolerance=_TOLERANCE, most=_SOLVER_STEPS
+        )
         seen = np.zeros(state.shape, bool)
         seen[:-1, :-1] = passed
         step = float(np.sqrt(np.mean((solution[0] - state.surface)[seen] ** 2)))
@@ -301,21 +380,48 @@ def _iterate(
             "joint inversion: iteration %d, %d data, residual %.3f, step %.3f m, %d solver steps",
             k + 1, len(rows.cell), state.residual[-1], step, used,
         )  # fmt: skip
-        progress("joint inversion", k + 2, total)
+        progress("joint inversion", k + 2, state.config.iterations + 3)
         if step < 0.02:
             break
-    return problem, passed, rows
+    return solved
 
 
-def _held_profiles(state: _State, rows: Rows) -> Equations:
+def _dark(state: _State, first: bool) -> list[BoolArray]:
+    """Return the samples of all rays that lie in shadow; none before the gain is known."""
+    if first or not state.config.shadows:
+        return [np.zeros(ray.power.shape, np.bool_) for ray in state.rays]
+    level = float(np.median(state.soundings.up_m - state.soundings.range_m))
+    return [
+        dark_samples(ray, np.full(len(ray.up_m), level), state.basis, state.gain, state.cell_m)
+        for ray in state.rays
+    ]
+
+
+def _caution(state: _State, rows: Rows) -> float:
+    """Return the step's caution: a quarter where many cells are seen along crossing directions.
+
+    There a gain cannot pass for a slope, and steps may be longer.
+    """
+    crossed = crossing(rows, state.shape)
+    seen = np.unique(rows.cell).size
+    return state.config.caution * (0.25 if float(np.sum(crossed)) > 0.1 * seen else 1.0)
+
+
+def _times(spectrum: Spectrum, factor: float) -> Spectrum:
+    return Spectrum(factor * spectrum.p0, factor * spectrum.p1, factor * spectrum.p2)
+
+
+def _held_profiles(state: _State, single: BoolArray, lit: BoolArray) -> Equations:
     """Return the mean profiles that one-sided looks must not change."""
     if state.base is None:
         # Once the first returns' lead is known: the surface of the soundings alone.
         state.base = _sounding_surface(state)
+    if float(np.sum(single)) < _MOSTLY_ONE_SIDED * float(np.sum(lit)):
+        single = np.zeros_like(single)
     spread = float(np.std(state.soundings.up_m - state.soundings.range_m))
     return mean_profiles(
         state.base, state.west_m, state.south_m, state.cell_m, state.rays,
-        one_sided(rows, state.shape), max(0.1 * spread, 0.02),
+        single, max(0.1 * spread, 0.02),
     )  # fmt: skip
 
 
@@ -340,7 +446,10 @@ def _learn_lead(state: _State, rows: Rows, rng: np.random.Generator) -> None:
             lead, spread = lead + part * mean, sigma
     state.lead_m, state.lead_sigma_m = lead, spread
     logger.info(
-        "first returns lead by %.3f +- %.3f m, %.0f %% seen by other passes", lead, spread, 100 * seen
+        "first returns lead by %.3f +- %.3f m, %.0f %% seen by other passes",
+        lead,
+        spread,
+        100 * seen,
     )
 
 
@@ -358,7 +467,7 @@ def _linearise(state: _State, rows: Rows, first: bool) -> _Data:
     scale = _scale_by_angle(residual, rows.angle_rad)
     # Residuals of the first pass are the relief itself: there the width is given, not measured.
     sigma = np.full(len(residual), 0.35) if first else np.maximum(scale, config.least_sigma)
-    unit = residual if first else residual / (2.5 * scale)
+    unit = residual if first else residual / (2.5 * sigma)
     weight = rows.share**2 / (1 + unit**2) / sigma**2
     weight[rows.ground_m < config.nadir * rows.drop_m] = 0.0
     lever = np.maximum(rows.ground_m - rows.drop_m * rows.slope, 0.3 * rows.ground_m)
@@ -386,7 +495,7 @@ def _linear_residual(rows: Rows, residual: FloatArray, exponent: float) -> Float
     wanted = np.sqrt((power**2 + np.sqrt(power**4 + 4 * power**2)) / 2)
     slope = (wanted * rows.ground_m - rows.drop_m) / (rows.ground_m + wanted * rows.drop_m)
     change = np.clip(slope - rows.slope, -0.6, 0.6)
-    return np.hypot(rows.c_east, rows.c_north) * change * (2.0 / exponent) ** 0
+    return np.hypot(rows.c_east, rows.c_north) * change
 
 
 def _scale_by_angle(residual: FloatArray, angle_rad: FloatArray) -> FloatArray:
@@ -401,27 +510,77 @@ def _scale_by_angle(residual: FloatArray, angle_rad: FloatArray) -> FloatArray:
     return np.maximum(scale, 1e-3)
 
 
-def _sample(problem: Problem, state: _State, rng: np.random.Generator) -> FloatArray:
-    """Draw a deviation of the surface from the posterior."""
-    zero = (np.zeros(state.shape), np.zeros(state.shape), np.zeros(state.basis.size))
-    solution, _ = problem.solve(zero, problem.perturbation(rng), tolerance=3e-2, most=20)
-    return solution[0]
+def _spread(
+    state: _State, solved: _Solved, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return the 1-sigma of the heights, jointly and from the soundings alone, by perturbation."""
+    weight = solved.data.weight * state.config.independent
+    # One-sided data rest on the gain alone; their share of the truth is small.
+    weight = np.where(solved.single.ravel()[solved.data.rows.cell], 0.1 * weight, weight)
+    joint = _problem(state, replace(solved.data, weight=weight), solved.equations)
+    alone = _problem(
+        state,
+        None,
+        sounding_equations(
+            state.surface,
+            state.west_m,
+            state.south_m,
+            state.cell_m,
+            state.soundings,
+            lead_m=state.lead_m,
+            lead_sigma_m=state.lead_sigma_m,
+        ),
+    )
+    return _sample_sigma(joint, state, rng), _sample_sigma(alone, state, rng)
 
 
-def _posterior_sigma(problem: Problem, state: _State, rng: np.random.Generator) -> FloatArray:
-    """Return the 1-sigma of the heights from solutions of perturbed problems."""
+def _sample_sigma(problem: Problem, state: _State, rng: np.random.Generator) -> FloatArray:
     total = np.zeros(state.shape)
-    n = state.config.samples
-    for _ in range(n):
-        total += _sample(problem, state, rng) ** 2
+    for _ in range(state.config.samples):
+        zero = (np.zeros(state.shape), np.zeros(state.shape), np.zeros(state.basis.size))
+        solution, _ = problem.solve(zero, problem.perturbation(rng), tolerance=3e-2, most=20)
+        total += solution[0] ** 2
     # Few samples: neighbours lend theirs, the spread varies slowly.
-    return np.sqrt(ndimage.uniform_filter(total / max(n, 1), 5, mode="nearest"))
+    return np.sqrt(ndimage.uniform_filter(total / state.config.samples, 7, mode="nearest"))
 
 
-def _result(
-    state: _State, sigma: FloatArray, passed: BoolArray, rows: Rows, crs: str
-) -> InversionResult:
+def _honest_sigma(state: _State, joint: FloatArray, alone: FloatArray) -> FloatArray:
+    """Return the sigma of the map, and hold the map to what the soundings allow.
+
+    A height further from the soundings' surface than three of its sigmas is no finding but a failure
+    of the model: it is drawn back, and its sigma is that of the soundings.
+    """
+    base = state.surface if state.base is None else state.base
+    limit = 3 * alone
+    beyond = np.abs(state.surface - base) > limit
+    state.surface = np.clip(state.surface, base - limit, base + limit)
+    # The lead of the first returns shifts the whole map; it is known to about a half.
+    sigma = np.sqrt(joint**2 + (0.5 * float(np.mean(state.lead_m))) ** 2)
+    return np.where(beyond, np.maximum(sigma, alone), sigma)
+
+
+def _resample(values: FloatArray, source: _State, target: _State) -> FloatArray:
+    """Read a field of one frame on the nodes of another; beyond the edge the edge's value."""
+    row = target.south_m + np.arange(target.shape[0]) * target.cell_m - source.south_m
+    col = target.west_m + np.arange(target.shape[1]) * target.cell_m - source.west_m
+    r, c = np.meshgrid(row / source.cell_m, col / source.cell_m, indexing="ij")
+    return np.asarray(ndimage.map_coordinates(values, [r, c], order=1, mode="nearest"))
+
+
+def _hand_down(coarse: _State, fine: _State) -> None:
+    """Let the fine problem start where the coarse one ended."""
+    fine.surface = _resample(coarse.surface, coarse, fine)
+    fine.albedo = _resample(coarse.albedo, coarse, fine)
+    if coarse.base is not None:
+        fine.base = _resample(coarse.base, coarse, fine)
+    fine.gain, fine.roughness = coarse.gain, coarse.roughness
+    fine.lead_m, fine.lead_sigma_m = coarse.lead_m, coarse.lead_sigma_m
+    fine.residual, fine.step_m = list(coarse.residual), list(coarse.step_m)
+
+
+def _result(state: _State, sigma: FloatArray, solved: _Solved, crs: str) -> InversionResult:
     """Cut the fields to what was seen and turn them to the records' row order."""
+    rows, passed = solved.data.rows, solved.passed
     seen = np.zeros(state.shape, bool)
     seen[:-1, :-1] |= passed
     seen[1:, 1:] |= passed

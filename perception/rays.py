@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -168,6 +168,18 @@ def _stacked_power(echo: FloatArray, chosen: IntArray) -> FloatArray:
     total /= chosen.shape[1]
     total[~np.isfinite(total)] = -1.0
     return total
+
+
+def of_unit_level(rays: list[Rays]) -> list[Rays]:
+    """Return the rays with powers divided by their common median: the recorder's unit is arbitrary."""
+    lit = [float(np.median(r.power[r.power > 0])) for r in rays if np.any(r.power > 0)]
+    if not lit:
+        return rays
+    level = float(np.median(lit))
+    return [
+        replace(r, power=np.where(r.power >= 0, r.power / level, -1.0).astype(np.float32))
+        for r in rays
+    ]
 
 
 def stack_soundings(look: Look, cell_m: float, floor_sigma_m: float) -> Soundings | None:

@@ -61,13 +61,21 @@ def fit_spectrum(
     def misfit(parameters: FloatArray) -> FloatArray:
         p0, p1, p2 = np.exp(parameters)
         model = kernel @ (1 / (p0 + p1 * k**2 + p2 * k**4))
-        return np.sqrt(weight) * (np.log(model) - np.log(value_m2))
+        power = 1 / (p0 + p1 * k**2 + p2 * k**4)
+        variance = float(np.sum(k * power * np.gradient(k))) / (2 * np.pi)
+        # Lines say nothing of waves much longer than themselves: those are not let loose.
+        excess = max(0.0, float(np.log(variance / value_m2.max())))
+        return np.append(np.sqrt(weight) * (np.log(model) - np.log(value_m2)), 5.0 * excess)
 
     level = float(value_m2.max())
     scale = float(lag_m[len(lag_m) // 2])
     start = np.log([1 / (level * scale**2), 1 / level, scale**2 / level])
-    fit = optimize.least_squares(misfit, start, bounds=(start - 14, start + 14), loss="soft_l1")
-    p0, p1, p2 = np.exp(fit.x)
+    fits = [
+        optimize.least_squares(misfit, start + shift, bounds=(start - 9, start + 9))
+        # The three terms trade places: a smooth floor has hardly any of the middle one.
+        for shift in (np.zeros(3), np.array([3.0, -4.0, 0.0]), np.array([-2.0, 2.0, -1.0]))
+    ]
+    p0, p1, p2 = np.exp(min(fits, key=lambda fit: fit.cost).x)
     return Spectrum(float(p0), float(p1), float(p2))
 
 

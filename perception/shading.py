@@ -77,6 +77,7 @@ def trace(
     cell_m: float,
     rays: Sequence[Rays],
     exponent: float,
+    dark: Sequence[BoolArray],
 ) -> tuple[Rows, BoolArray]:
     """Compare all rays' echoes with what the surface should have echoed.
 
@@ -84,6 +85,7 @@ def trace(
     ----------
     surface : (rows, cols) heights of the nodes, south to north; node (0, 0) at (west_m, south_m).
     exponent : n of the angle law ``cos(incidence)^n``.
+    dark : per rays (n, m) True where the sample is shadow and tells nothing of slope.
 
     Returns
     -------
@@ -98,12 +100,12 @@ def trace(
     parts: dict[str, list[npt.NDArray[Any]]] = {
         name: [] for name in (*_COLUMNS, "cell", "samples", "side", "look")
     }
-    for ray in rays:
+    for ray, hidden in zip(rays, dark, strict=True):
         sums[:] = 0.0
         trace_rays(
             surface, west_m, south_m, cell_m, ray.easting_m, ray.northing_m, ray.up_m,
             ray.azimuth_rad, ray.tilt_rad, ray.power, ray.sample_m, exponent,
-            cell_m / _FACETS_PER_CELL, _LEAST_TANGENT, sums, passed,
+            cell_m / _FACETS_PER_CELL, _LEAST_TANGENT, hidden, sums, passed,
         )  # fmt: skip
         cell = np.flatnonzero(sums[:, 0] > 0)
         weight = sums[cell, 0]
@@ -118,9 +120,9 @@ def trace(
 
 
 @njit(cache=True)
-def trace_rays(
+def trace_rays(  # type: ignore[no-untyped-def]
     z, west, south, cell, east, north, up, azimuth, tilt, power, sample_m, exponent, step, floor,
-    sums, passed,
+    dark, sums, passed,
 ):  # fmt: skip
     """Add the facets of all rays to `sums` (dual cells, weight and `_COLUMNS`), mark `passed`."""
     n, m = power.shape
@@ -237,7 +239,7 @@ def trace_rays(
                    - predicted[ia] - fa * (predicted[ia + 1] - predicted[ia]))  # fmt: skip
             num = (known[ib] + fb * (known[ib + 1] - known[ib])
                    - known[ia] - fa * (known[ia + 1] - known[ia]))  # fmt: skip
-            if num < 0.9 * (kb - ka) or pre <= 0:
+            if num < 0.9 * (kb - ka) or pre <= 0 or dark[i, (ia + ib) // 2]:
                 continue
             p = (zed[j + 1] - zed[j]) / step
             g = (j + 1) * step

@@ -57,8 +57,8 @@ def sounding_equations(
     much the first return precedes that of the smooth surface, see `perception.first_return`.
     """
     if below:
-        across = np.zeros(len(bottom.range_m))
-        height = bottom.up_m - bottom.range_m
+        across: FloatArray = np.zeros(len(bottom.range_m))
+        height: FloatArray = bottom.up_m - bottom.range_m
     else:
         across, height = nearest_points(surface, west_m, south_m, cell_m, bottom)
     east = bottom.easting_m + np.cos(bottom.heading_rad) * across

@@ -1,0 +1,159 @@
+"""Stencils of the joint inversion: small loops over nodes, dual cells and data rows.
+
+Arrays: `z` and `a` are (rows, cols) nodes; features and moments are (k, rows - 1, cols - 1) or flat
+(k, duals); data rows are (n,) with the index of their dual cell.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from numba import njit
+
+
+@njit(cache=True, fastmath=True)
+def dual_features(z, a, cell, out):
+    """Write (gradient east, gradient north, mean z, mean a) of every dual cell to `out` (4, r, c)."""
+    rows, cols = z.shape
+    for i in range(rows - 1):
+        for j in range(cols - 1):
+            sw, se, nw, ne = z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]
+            out[0, i, j] = (se + ne - sw - nw) / (2 * cell)
+            out[1, i, j] = (nw + ne - sw - se) / (2 * cell)
+            out[2, i, j] = 0.25 * (sw + se + nw + ne)
+            out[3, i, j] = 0.25 * (a[i, j] + a[i, j + 1] + a[i + 1, j] + a[i + 1, j + 1])
+
+
+@njit(cache=True, fastmath=True)
+def spread_features(q, cell, out_z, out_a):
+    """Add the transpose of `dual_features` applied to `q` (4, r, c)."""
+    rows, cols = out_z.shape
+    for i in range(rows - 1):
+        for j in range(cols - 1):
+            e = q[0, i, j] / (2 * cell)
+            n = q[1, i, j] / (2 * cell)
+            m = 0.25 * q[2, i, j]
+            b = 0.25 * q[3, i, j]
+            out_z[i, j] += m - e - n
+            out_z[i, j + 1] += m + e - n
+            out_z[i + 1, j] += m - e + n
+            out_z[i + 1, j + 1] += m + e + n
+            out_a[i, j] += b
+            out_a[i, j + 1] += b
+            out_a[i + 1, j] += b
+            out_a[i + 1, j + 1] += b
+
+
+@njit(cache=True, fastmath=True)
+def apply_data(moments, z, a, cell, out_z, out_a):
+    """Add the data's normal matrix applied to (z, a)."""
+    rows, cols = z.shape
+    for i in range(rows - 1):
+        for j in range(cols - 1):
+            if moments[9, i, j] == 0.0:
+                continue
+            sw, se, nw, ne = z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]
+            f0 = (se + ne - sw - nw) / (2 * cell)
+            f1 = (nw + ne - sw - se) / (2 * cell)
+            f2 = 0.25 * (sw + se + nw + ne)
+            f3 = 0.25 * (a[i, j] + a[i, j + 1] + a[i + 1, j] + a[i + 1, j + 1])
+            m = moments[:, i, j]
+            e = (m[0] * f0 + m[1] * f1 + m[2] * f2 + m[3] * f3) / (2 * cell)
+            n = (m[1] * f0 + m[4] * f1 + m[5] * f2 + m[6] * f3) / (2 * cell)
+            c = 0.25 * (m[2] * f0 + m[5] * f1 + m[7] * f2 + m[8] * f3)
+            b = 0.25 * (m[3] * f0 + m[6] * f1 + m[8] * f2 + m[9] * f3)
+            out_z[i, j] += c - e - n
+            out_z[i, j + 1] += c + e - n
+            out_z[i + 1, j] += c - e + n
+            out_z[i + 1, j + 1] += c + e + n
+            out_a[i, j] += b
+            out_a[i, j + 1] += b
+            out_a[i + 1, j] += b
+            out_a[i + 1, j + 1] += b
+
+
+@njit(cache=True, fastmath=True)
+def apply_prior(z, k0, k1, k2, out):
+    """Add (k0 + k1 D'D + k2 L'L) z: D first differences, L the five-point Laplacian."""
+    rows, cols = z.shape
+    for i in range(rows):
+        for j in range(cols):
+            out[i, j] += k0 * z[i, j]
+            if j + 1 < cols:
+                e = k1 * (z[i, j + 1] - z[i, j])
+                out[i, j + 1] += e
+                out[i, j] -= e
+            if i + 1 < rows:
+                e = k1 * (z[i + 1, j] - z[i, j])
+                out[i + 1, j] += e
+                out[i, j] -= e
+    # Second differences along each axis and the twist: together the thin plate, free at its edges.
+    for i in range(rows):
+        for j in range(cols):
+            if 0 < j < cols - 1:
+                e = k2 * (z[i, j + 1] - 2 * z[i, j] + z[i, j - 1])
+                out[i, j + 1] += e
+                out[i, j] -= 2 * e
+                out[i, j - 1] += e
+            if 0 < i < rows - 1:
+                e = k2 * (z[i + 1, j] - 2 * z[i, j] + z[i - 1, j])
+                out[i + 1, j] += e
+                out[i, j] -= 2 * e
+                out[i - 1, j] += e
+            if j + 1 < cols and i + 1 < rows:
+                e = 2 * k2 * (z[i + 1, j + 1] - z[i + 1, j] - z[i, j + 1] + z[i, j])
+                out[i + 1, j + 1] += e
+                out[i + 1, j] -= e
+                out[i, j + 1] -= e
+                out[i, j] += e
+
+
+@njit(cache=True, fastmath=True)
+def rows_to_gain(cell, weight, c_east, c_north, c_level, knot, share, features, out):
+    """Add to `out` (knots) what the data rows say of the fields' `features` (4, duals)."""
+    for i in range(len(cell)):
+        q = cell[i]
+        v = weight[i] * (c_east[i] * features[0, q] + c_north[i] * features[1, q]
+                         + c_level[i] * features[2, q] + features[3, q])  # fmt: skip
+        for k in range(knot.shape[1]):
+            out[knot[i, k]] += v * share[i, k]
+
+
+@njit(cache=True, fastmath=True)
+def gain_to_features(cell, value, c_east, c_north, c_level, out):
+    """Add weighted row values to the features (4, duals) of their cells."""
+    for i in range(len(cell)):
+        q = cell[i]
+        v = value[i]
+        out[0, q] += v * c_east[i]
+        out[1, q] += v * c_north[i]
+        out[2, q] += v * c_level[i]
+        out[3, q] += v
+
+
+@njit(cache=True, fastmath=True)
+def accumulate_moments(cell, weight, c_east, c_north, c_level, out):
+    """Add the rows to the cells' 4x4 matrices (10, duals)."""
+    for i in range(len(cell)):
+        q = cell[i]
+        w = weight[i]
+        e, n, c = c_east[i], c_north[i], c_level[i]
+        out[0, q] += w * e * e
+        out[1, q] += w * e * n
+        out[2, q] += w * e * c
+        out[3, q] += w * e
+        out[4, q] += w * n * n
+        out[5, q] += w * n * c
+        out[6, q] += w * n
+        out[7, q] += w * c * c
+        out[8, q] += w * c
+        out[9, q] += w
+
+
+@njit(cache=True, fastmath=True)
+def gain_normal(knot, share, weight, out):
+    """Add the rows' normal matrix in the gains alone to `out` (knots, knots)."""
+    for i in range(knot.shape[0]):
+        for k in range(knot.shape[1]):
+            for q in range(knot.shape[1]):
+                out[knot[i, k], knot[i, q]] += weight[i] * share[i, k] * share[i, q]
