@@ -127,11 +127,17 @@ def correct_survey(
     fixes: Sequence[PositionFix] = (),
     config: SurveyConfig | None = None,
     progress: Progress = silent,
+    floor: Grid | None = None,
 ) -> CorrectedSurvey:
     """Correct the tracks of a survey by what its passes saw twice and by absolute fixes.
 
     The strips' positions are taken as dead reckoning of unknown start: differences are the odometry.
     Without fixes the start is held to `GraphConfig.start_m`.
+
+    Parameters
+    ----------
+    floor : a map of the ground, from an earlier round of mapping, that tells where echoes came from; default
+        what the strips' own soundings say of it.
 
     Raises
     ------
@@ -163,6 +169,7 @@ def correct_survey(
             config,
             progress,
             number,
+            floor,
         )
         moved = after.correction_m - solution.correction_m
         moved_m = float(np.sqrt((moved**2).sum(axis=1).mean()))
@@ -246,10 +253,12 @@ def _round(
     config: SurveyConfig,
     progress: Progress,
     number: int,
+    floor: Grid | None,
 ) -> tuple[list[Registration], Solution]:
     """Compare the passes over every window and solve the graph with what came of it."""
     textures: dict[int, Texture] = {}
-    floor = known_floor(corrected)
+    unknown_m = None if floor is None or floor.sigma_m is None else _typical(floor.sigma_m)
+    floor = known_floor(corrected) if floor is None else floor
     results: list[tuple[Window, Match]] = []
     links: list[Link] = []
     for done, window in enumerate(windows, start=1):
@@ -281,7 +290,9 @@ def _round(
         if result.accepted:
             link = _link(keyframes, solution, window, result, ends, config.graph)
             misplaced = [
-                _misplacement(corrected[int(keyframes.strip[k])], keyframes, k, link_offset)
+                _misplacement(
+                    corrected[int(keyframes.strip[k])], keyframes, k, link_offset, unknown_m
+                )
                 for k, link_offset in zip(
                     ends, (link.first_offset_m, link.second_offset_m), strict=True
                 )
@@ -355,17 +366,25 @@ def _link(
     )
 
 
+def _typical(sigma_m: FloatArray) -> float:
+    return float(np.nanmedian(sigma_m))
+
+
 # The part of the floor's unevenness along a track that stays unknown beside it.
 _UNKNOWN_RELIEF = 0.4
 
 
 def _misplacement(
-    strip: ElevationStrip, keyframes: Keyframes, keyframe: int, offset_m: FloatArray
+    strip: ElevationStrip,
+    keyframes: Keyframes,
+    keyframe: int,
+    offset_m: FloatArray,
+    unknown_m: float | None,
 ) -> FloatArray:
     """Return the (2, 2) covariance by which unknown relief misplaces a square of ground.
 
     Ground that lies h above the floor beneath the track is drawn h a / x towards it (`placed_across`). What
-    is unknown of h is taken as a part of how uneven the floor is along the track.
+    is unknown of h is the floor map's sigma, or else a part of how uneven the floor is along the track.
     """
     heading = float(keyframes.heading_rad[keyframe])
     starboard = np.array([np.cos(heading), -np.sin(heading)])
@@ -374,7 +393,8 @@ def _misplacement(
     beneath = -(strip.depth_m + strip.altitude_m)
     unevenness = float(np.nanstd(beneath)) if np.isfinite(beneath).any() else 0.1 * altitude
     away = max(abs(float(offset_m @ starboard)), altitude, 1e-6)
-    sigma = _UNKNOWN_RELIEF * unevenness * altitude / away
+    unknown_m = _UNKNOWN_RELIEF * unevenness if unknown_m is None else unknown_m
+    sigma = unknown_m * altitude / away
     return sigma**2 * np.outer(starboard, starboard)
 
 
