@@ -1,7 +1,7 @@
 # Two commands: `make demo` and `make test`. Stamp files keep a half-made environment from passing
 # for a whole one: a failed `python -m venv` leaves a folder behind.
 
-PYTHON ?= $(firstword $(foreach v,3.11 3.12 3.13,$(if $(shell python$(v) -c "import venv, ensurepip" 2>/dev/null && echo yes),python$(v))))
+PYTHON ?= $(firstword $(foreach v,3.11 3.12 3.13 3,$(if $(shell python$(v) -c "import sys, venv, ensurepip; assert (3, 11) <= sys.version_info[:2] <= (3, 13)" 2>/dev/null && echo yes),python$(v))))
 VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: -c constraints.txt

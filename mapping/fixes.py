@@ -55,7 +55,7 @@ def read_fixes(path: Path) -> list[PositionFix]:
         A column is missing, or a value is no number, no time, or a sigma that is not positive.
     """
     path = existing_file(path)
-    with path.open(newline="", encoding="utf-8", errors="replace") as stream:
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as stream:
         rows = csv.DictReader(stream)
         missing = [c for c in _FIX_COLUMNS if c not in (rows.fieldnames or ())]
         if missing:
@@ -73,7 +73,7 @@ def _fix_of_row(path: Path, line: int, row: dict[str, str]) -> PositionFix:
     try:
         time_s = _utc_seconds(row["time"])
         easting_m, northing_m, sigma_m = (float(row[c]) for c in _FIX_COLUMNS[1:])
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: line {line}: {error}; mend or remove the line") from error
     if not np.isfinite([easting_m, northing_m]).all():
         raise InputError(f"{path}: line {line}: the position is not finite; remove the line")

@@ -66,10 +66,10 @@ def _main_subdataset(path: Path) -> str:
 
 def _grid_of(source: Any, path: Path, sigma_m: float | None) -> Grid:
     _refuse_unusable_frame(source, path)
-    descriptions = [(d or "").lower() for d in source.descriptions]
+    descriptions = _descriptions(source)
     elevation_band = _band_named(descriptions, _ELEVATION_NAMES) or 1
     elevation_m = _read_band(source, elevation_band)
-    if descriptions[elevation_band - 1].startswith("depth"):
+    if _points_down(source, elevation_band, descriptions[elevation_band - 1]):
         elevation_m = -elevation_m
     if not np.isfinite(elevation_m).any():
         raise InputError(
@@ -81,6 +81,8 @@ def _grid_of(source: Any, path: Path, sigma_m: float | None) -> Grid:
         sigma = np.where(np.isfinite(elevation_m), float(sigma_m), np.nan)
     elif sigma_band is not None:
         sigma = _known(_read_band(source, sigma_band))
+    else:
+        sigma = _sibling_sigma(source, path)
     count_band = _band_named(descriptions, ("count",))
     transform = source.transform
     return Grid(
@@ -94,6 +96,38 @@ def _grid_of(source: Any, path: Path, sigma_m: float | None) -> Grid:
         count=None if count_band is None else _known(_read_band(source, count_band)),
         datum=source.tags().get("VERTICAL_DATUM", ""),
     )
+
+
+def _descriptions(source: Any) -> list[str]:
+    """Return the bands' names in lower case; a NetCDF keeps its variable's name in a tag."""
+    return [
+        (name or source.tags(band).get("NETCDF_VARNAME", "")).lower()
+        for band, name in enumerate(source.descriptions, start=1)
+    ]
+
+
+def _points_down(source: Any, band: int, name: str) -> bool:
+    """Return whether a band holds depths: by CF's `positive`, or else by its name."""
+    tags = {**source.tags(), **source.tags(band)}
+    for key, value in tags.items():
+        if key.rsplit("#", 1)[-1] == "positive" and key.split("#")[0].lower() in ("positive", name):
+            return str(value).lower() == "down"
+    return name.startswith("depth")
+
+
+def _sibling_sigma(source: Any, path: Path) -> npt.NDArray[np.float64] | None:
+    """Return the sigma that stands beside the heights as another variable of a NetCDF; None none."""
+    if not str(source.name).lower().startswith("netcdf:"):
+        return None
+    with rasterio.open(path) as whole:
+        names = list(whole.subdatasets)
+    for wanted in _SIGMA_NAMES:
+        for name in names:
+            if name.rsplit(":", 1)[-1].strip("/").lower() == wanted:
+                with rasterio.open(name) as beside:
+                    if beside.shape == source.shape:
+                        return _known(_read_band(beside, 1))
+    return None
 
 
 def _known(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from perception.files import existing_file, write_text
+from perception.geodesy import convergence
 from perception.records import FloatArray, InputError, Trajectory
 
 # Tenths of a millimetre and microseconds: below any sensor, and short lines for long surveys.
@@ -73,6 +75,15 @@ def iso_times(time_s: FloatArray) -> list[str]:
     micro = np.round(np.where(known, time_s, 0.0) * 1e6).astype("datetime64[us]")
     texts = np.datetime_as_string(micro, unit="us")
     return [f"{text}Z" if ok else "" for text, ok in zip(texts.tolist(), known, strict=True)]
+
+
+def from_true_north(trajectory: Trajectory) -> Trajectory:
+    """Return the trajectory with headings from true north, as files have them; inside, grid north rules."""
+    if not trajectory.crs:
+        return trajectory
+    turn_rad = convergence(trajectory.easting_m, trajectory.northing_m, trajectory.crs)
+    heading_rad = (trajectory.heading_rad + np.nan_to_num(turn_rad)) % (2 * np.pi)
+    return replace(trajectory, heading_rad=heading_rad)
 
 
 def read_trajectory(path: Path, crs: str = "") -> Trajectory:
@@ -143,7 +154,8 @@ def _times(path: Path, table: pd.DataFrame) -> tuple[FloatArray, bool]:
         plain = _numbers(path, table, "time")
     except InputError:
         stamps = pd.to_datetime(table["time"], utc=True, format="ISO8601", errors="coerce")
-        bad = stamps.isna().to_numpy()
+        # An empty time is a pose whose time is not known, as `write_trajectory` writes it.
+        bad = stamps.isna().to_numpy() & (table["time"].str.strip() != "").to_numpy()
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
             raise InputError(
@@ -151,6 +163,7 @@ def _times(path: Path, table: pd.DataFrame) -> tuple[FloatArray, bool]:
                 "give ISO 8601 UTC (2026-01-31T12:00:00Z) or seconds"
             ) from None
         seconds = stamps.to_numpy("datetime64[us]").astype(np.int64) * 1e-6
+        seconds = np.where(stamps.isna().to_numpy(), np.nan, seconds)
         return seconds, True
     return (_numbers(path, table, "time_s") if "time_s" in table else plain), False
 

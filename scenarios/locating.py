@@ -174,7 +174,7 @@ def summary(result: Navigation, nav: NavTable, terrain: TerrainMap) -> dict[str,
         "map_sigma_filtered_m": terrain.error.total_m,
         "map_relief_m": terrain.relief_m,
         "verdict": _verdict(result, bool(converged.size)),
-        "events": dict(reasons.most_common(12)),
+        "events": "; ".join(f"{count} x {text}" for text, count in reasons.most_common(12)),
     }
 
 

@@ -1,7 +1,4 @@
-"""Errors against truth: the only module that reads a simulation's `truth/` folder.
-
-Estimators never import it; it runs after they have written their results.
-"""
+"""Errors against truth. Estimators never import it; it runs after they have written their results."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import QhullError
 
 from perception.records import FloatArray, Grid, NoOverlapError, Trajectory
 
@@ -105,9 +103,11 @@ def interpolated_soundings(
     origin = np.array([frame.west_m, frame.south_m])
     points = np.column_stack([easting_m[good], northing_m[good]]) - origin
     e, n = frame.centres()
-    surface = LinearNDInterpolator(points, elevation_m[good])(
-        (e - origin[0])[None, :], (n - origin[1])[:, None]
-    )
+    try:
+        interpolator = LinearNDInterpolator(points, elevation_m[good])
+        surface = interpolator((e - origin[0])[None, :], (n - origin[1])[:, None])
+    except QhullError:  # fewer than three soundings, or all on one line: nothing lies between them
+        surface = np.full(frame.shape, np.nan)
     return Grid(
         surface, frame.west_m, frame.north_m, frame.cell_m, frame.crs,
         cell_height_m=frame.cell_height_m,

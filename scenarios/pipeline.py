@@ -24,6 +24,7 @@ from perception.records import InputError, NoPathError
 from scenarios.outputs import read_metrics, versions, write_metrics
 from scenarios.schema import Scenario, scenario_of, tree_of
 
+_MARK = ".stage.json"  # in a stage's folder: which mission filled it
 STAGES = ("simulate", "strips", "map", "regions", "locate", "plan")
 
 
@@ -116,6 +117,7 @@ def run_mission(
     """
     if until and until not in STAGES:
         raise InputError(f"until = {until!r} is no stage; there are {', '.join(STAGES)}")
+    _refuse_foreign(out)
     if (out / "metrics.json").exists():
         _start_clean(out)
     write_text(out / "scenario.toml", tomli_w.dumps(tree_of(scenario)))
@@ -132,6 +134,16 @@ def run_mission(
     metrics = _mission_metrics(out, [s.name for s in stages], seconds)
     write_metrics(out, metrics, tree_of(scenario), scenario.seed)
     return metrics
+
+
+def _refuse_foreign(out: Path) -> None:
+    """Refuse a folder in which a stage's subfolder was not made by a mission: it would be replaced."""
+    for name in STAGES:
+        folder = out / name
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / _MARK).exists():
+            raise InputError(
+                f"{folder}: holds files that no mission wrote; give --out a new or empty folder"
+            )
 
 
 def _start_clean(out: Path) -> None:
@@ -161,12 +173,14 @@ def _run_stage(stage: Stage, out: Path, key: str, quiet: bool) -> float:
     from scenarios.commands import bathynav
 
     folder = out / stage.name
-    mark = folder / ".stage.json"
+    mark = folder / _MARK
     if mark.exists():
         done = json.loads(mark.read_text(encoding="utf-8"))
         if done["key"] == key:
             return float(done["seconds"])
     shutil.rmtree(folder, ignore_errors=True)
+    # Marked before it is filled: a killed stage's folder is known for a mission's own.
+    write_text(mark, json.dumps({"key": "", "seconds": 0.0}) + "\n")
     began = time.perf_counter()
     line = [*stage.arguments, "--out", str(folder)]
     try:

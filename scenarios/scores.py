@@ -38,13 +38,20 @@ def score_map(folder: Path, truth: Path) -> dict[str, float]:
     track = read_trajectory(folder / "trajectory.csv")
     raw = read_trajectory(folder / "trajectory-navigated.csv")
     soundings = _soundings(folder, grid)
-    ours, simple = map_error(grid, floor, soundings.elevation_m), map_error(soundings, floor)
+    between = np.where(np.isfinite(grid.elevation_m), soundings.elevation_m, np.nan)
+    beside: dict[str, float] = {}
+    # A single straight line has nothing between its soundings to compare.
+    if np.isfinite(between).any():
+        ours, simple = map_error(grid, floor, between), map_error(soundings, floor, between)
+        beside = {
+            "map_mae_between_tracks_m": ours.mean_absolute_m,
+            "soundings_mae_between_tracks_m": simple.mean_absolute_m,
+            "map_to_soundings_ratio": ours.mean_absolute_m / simple.mean_absolute_m,
+        }
     before, after = track_rms_m(_used(raw), flown), track_rms_m(_used(track), flown)
     return {
         **map_error(grid, floor).flat("map"),
-        "map_mae_between_tracks_m": ours.mean_absolute_m,
-        "soundings_mae_between_tracks_m": simple.mean_absolute_m,
-        "map_to_soundings_ratio": ours.mean_absolute_m / simple.mean_absolute_m,
+        **beside,
         "track_rms_before_m": before,
         "track_rms_after_m": after,
         "track_cut_percent": percent_cut(before, after),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from mapping.fixes import PositionFix
 from mapping.fusion import fuse
+from mapping.one_sided import hold_one_sided
 from mapping.survey import CorrectedSurvey, correct_survey
 from perception.bottom import BottomTrack
 from perception.levels import SHADOW
@@ -115,22 +116,24 @@ def map_survey(
     results = build_passes(survey, progress) if passes is None else tuple(passes)
     corrected = correct_survey([r.strip for r in results], fixes, progress=progress)
     track = whole_track(survey, corrected.trajectory)
+    strips = corrected.strips
+    grid = fuse(
+        strips,
+        cell_m=cell_m,
+        crs=survey.crs,
+        trajectory=corrected.trajectory,
+        height_sigma_m=corrected.height_sigma_m,
+        progress=progress,
+    )
     inversion = None
     if method == "joint":
         from perception.inversion import invert
 
         looks = [_look(survey, i, result, corrected, track) for i, result in enumerate(results)]
         inversion = invert(looks, cell_m, crs=survey.crs, progress=progress)
-        grid = with_pose_sigma(inversion.grid, track, corrected.height_sigma_m)
-    else:
-        grid = fuse(
-            corrected.strips,
-            cell_m=cell_m,
-            crs=survey.crs,
-            trajectory=corrected.trajectory,
-            height_sigma_m=corrected.height_sigma_m,
-            progress=progress,
-        )
+        altitude_m = float(np.median(np.concatenate([strip.altitude_m for strip in strips])))
+        held = hold_one_sided(inversion.grid, grid, strips, altitude_m)
+        grid = with_pose_sigma(held, track, corrected.height_sigma_m)
     grid = replace(grid, datum=survey.datum)
     objects = tuple(corrected_objects(p.objects, track) for p in results)
     return SurveyMap(grid, track, navigated_track(survey), results, corrected, objects, inversion)
@@ -185,12 +188,11 @@ def build_passes(
 def _identity(survey: Survey) -> tuple[object, ...]:
     """Return what makes two openings of a survey the same: its files as they are, its frame, its poses."""
     files = tuple((str(f.path.resolve()), *_stamp(f.path)) for f in survey.files)
-    pings = survey.pings
-    poses = tuple(
-        hash(np.ascontiguousarray(getattr(pings, name)).tobytes())
-        for name in ("easting_m", "northing_m", "depth_m", "heading_rad", "sample_m", "pass_index")
+    headers = tuple(
+        hash(np.ascontiguousarray(getattr(survey.pings, f.name)).tobytes())
+        for f in fields(survey.pings)
     )
-    return (*files, survey.crs, *poses)
+    return (*files, survey.crs, *headers)
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -240,6 +242,8 @@ def whole_track(survey: Survey, corrected: Trajectory) -> Trajectory:
             return mine
         return mine + np.interp(every, known[good], (theirs[order] - mine[known])[good])
 
+    numbers, kept = survey.pings.pass_index, corrected.pass_index
+    used = np.isin(numbers, kept) if kept is not None else numbers >= 0
     turn = np.angle(np.exp(1j * (corrected.heading_rad[order] - raw.heading_rad[known])))
     return replace(
         raw,
@@ -249,6 +253,7 @@ def whole_track(survey: Survey, corrected: Trajectory) -> Trajectory:
         sigma_easting_m=carried(corrected.sigma_easting_m),
         sigma_northing_m=carried(corrected.sigma_northing_m),
         cov_en_m2=carried(corrected.cov_en_m2),
+        pass_index=np.where(used, numbers, -1),
     )
 
 
@@ -283,12 +288,21 @@ def with_pose_sigma(grid: Grid, track: Trajectory, height_sigma_m: FloatArray) -
         return grid
     used = np.ones(len(track.time_s), bool) if track.pass_index is None else track.pass_index >= 0
     # Half of the trace: the slope has a direction, the error another.
-    place_m2 = 0.5 * np.nanmean((track.sigma_easting_m**2 + track.sigma_northing_m**2)[used])
+    place_m2 = 0.5 * (track.sigma_easting_m**2 + track.sigma_northing_m**2)[used]
+    place_m2 = place_m2[np.isfinite(place_m2)]
+    if not place_m2.size:
+        raise InputError(
+            "the passes do not determine the track's accuracy, so the map has no sigma; "
+            "give absolute positions with --fixes"
+        )
     known = height_sigma_m[np.isfinite(height_sigma_m)]
     height_m2 = float(np.mean(known**2)) if known.size else 0.0
-    down, across = np.gradient(grid.elevation_m, grid.cell_north_m, grid.cell_m)
-    slope2 = np.nan_to_num(down**2 + across**2)
-    return replace(grid, sigma_m=np.sqrt(grid.sigma_m**2 + slope2 * place_m2 + height_m2))
+    slope2 = np.zeros(grid.shape)
+    for axis, cell_m in enumerate((grid.cell_north_m, grid.cell_m)):
+        if grid.shape[axis] > 1:
+            slope2 += np.nan_to_num(np.gradient(grid.elevation_m, cell_m, axis=axis)) ** 2
+    variance = grid.sigma_m**2 + slope2 * float(np.mean(place_m2)) + height_m2
+    return replace(grid, sigma_m=np.sqrt(variance))
 
 
 def _look(

@@ -24,7 +24,9 @@ from scenarios.commands.console import (
 @click.option("--map-sigma", type=click.FloatRange(min=0, min_open=True), help="1-sigma of the map, m; else its band, else IHO S-44 Order 1a.")  # fmt: skip
 @click.option("--map-error-length", type=click.FloatRange(min=0), help="Correlation length of the map's error, m; else what its spectrum tells.")  # fmt: skip
 @click.option("--particles", type=click.IntRange(200, 200_000), default=4000, show_default=True, help="Particles of the search.")  # fmt: skip
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the search.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the search."
+)
 @click.option("--observability", is_flag=True, help="Map where terrain can fix a vehicle, and how well; needs --map only.")  # fmt: skip
 @click.option("--altitude", type=click.FloatRange(min=0, min_open=True), default=50.0, show_default=True, help="Altitude for --observability, m.")  # fmt: skip
 @click.option("--path", "path_m", type=click.FloatRange(min=1), default=300.0, show_default=True, help="Length of track for --observability, m.")  # fmt: skip

@@ -17,7 +17,10 @@ from scenarios.commands.console import (
     set_verbosity,
 )
 
+_FIX_REACH_S = 3600.0  # fixes further from every ping say nothing of the survey
+
 if TYPE_CHECKING:
+    from mapping.fixes import PositionFix
     from perception.readers import Survey
     from perception.records import FloatArray, Grid
     from scenarios.survey_map import SurveyMap
@@ -28,7 +31,7 @@ if TYPE_CHECKING:
 @out_option
 @click.option("--cell", type=click.FloatRange(min=0, min_open=True), help="Cell of the map, m.")
 @click.option("--crs", help="Projected CRS in metres (EPSG:N); default the data's UTM zone.")
-@click.option("--prior", type=click.Path(path_type=Path), help="A map to tie the survey to.")
+@click.option("--prior", type=click.Path(path_type=Path), help="A map to tie the heights to.")
 @click.option("--fixes", type=click.Path(path_type=Path), help="Absolute fixes, a CSV file.")
 @click.option("--install", type=click.Path(path_type=Path), help="Lever arms and mounting, TOML.")
 @click.option("--tide", type=click.Path(path_type=Path), help="Tide, a CSV file.")
@@ -63,6 +66,7 @@ def command(
     import time
 
     from mapping.fixes import read_fixes
+    from mapping.rasters import read_map
     from perception.installation import read_installation
     from perception.readers import open_survey
     from scenarios.survey_map import map_survey
@@ -70,16 +74,20 @@ def command(
     set_verbosity(quiet, verbose)
     prepare_out(out)
     absolute = read_fixes(fixes) if fixes is not None else []
+    old = read_map(prior) if prior is not None else None
     installation = read_installation(install, tide, sound_speed)
     began = time.perf_counter()
     with progress_bars(quiet) as progress:
         survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
-        for warning in survey.warnings:
-            click.echo(f"note: {warning}", err=True)
+        if not quiet:
+            for warning in survey.warnings:
+                click.echo(f"note: {warning}", err=True)
+        if absolute:
+            check_fixes(fixes, absolute, survey)
         result = map_survey(survey, fixes=absolute, cell_m=cell, method=method, progress=progress)
         metrics = _write(out, survey, result)
-        if prior is not None:
-            metrics |= tie_to_prior(out, result.grid, prior)
+        if old is not None:
+            metrics |= tie_to_prior(out, result.grid, old)
     config = {
         "surveys": [str(p) for p in surveys], "cell_m": cell, "crs": survey.crs, "method": method,
         "prior": prior, "fixes": fixes, "install": install, "tide": tide,
@@ -97,12 +105,12 @@ def _write(out: Path, survey: Survey, result: SurveyMap) -> dict[str, Any]:
     """Write the folder's files and return its metrics."""
     from mapping.mosaic import echo_mosaic, write_mosaic
     from mapping.rasters import write_map
-    from mapping.trajectories import write_trajectory
+    from mapping.trajectories import from_true_north, write_trajectory
     from scenarios.plots_survey import plot_layer, plot_map
 
     write_map(out / "map.tif", result.grid)
-    write_trajectory(out / "trajectory.csv", result.track)
-    write_trajectory(out / "trajectory-navigated.csv", result.raw_track)
+    write_trajectory(out / "trajectory.csv", from_true_north(result.track))
+    write_trajectory(out / "trajectory-navigated.csv", from_true_north(result.raw_track))
     _write_soundings(out / "soundings.csv", result)
     plot_map(out / "map.png", result.grid, result.raw_track, result.track)
     if result.grid.sigma_m is not None:
@@ -170,16 +178,34 @@ def _metrics(survey: Survey, result: SurveyMap) -> dict[str, Any]:
     }
 
 
-def tie_to_prior(out: Path, grid: Grid, prior: Path) -> dict[str, Any]:
+def check_fixes(path: Path | None, fixes: list[PositionFix], survey: Survey) -> None:
+    """Refuse fixes that no ping's time can meet: they would be taken for what they are not."""
+    import numpy as np
+
+    from perception.records import InputError
+
+    if not survey.utc:
+        raise InputError(
+            f"{path}: the survey's clock has no date, so no fix can be placed; leave --fixes out"
+        )
+    first, last = np.nanmin(survey.pings.time_s), np.nanmax(survey.pings.time_s)
+    if not any(first - _FIX_REACH_S <= fix.time_s <= last + _FIX_REACH_S for fix in fixes):
+        raise InputError(
+            f"{path}: no fix lies within an hour of the survey "
+            f"({np.datetime64(int(first), 's')} to {np.datetime64(int(last), 's')} UTC); "
+            "is it of another day, or in local time?"
+        )
+
+
+def tie_to_prior(out: Path, grid: Grid, old: Grid) -> dict[str, Any]:
     """Shift the map's heights onto a prior map's, say by how much, and how the two still differ.
 
     The shift is the median difference: tide and depth bias are common to a survey, changes of the
     floor are not.
     """
     from mapping.compare import difference, write_changes
-    from mapping.rasters import read_map, write_map
+    from mapping.rasters import write_map
 
-    old = read_map(prior)
     shift_m = _prior_shift(difference(grid, old).grid.elevation_m)
     tied = replace(grid, elevation_m=grid.elevation_m + shift_m, datum=old.datum or grid.datum)
     left = difference(tied, old)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from perception.records import InputError, NoPathError
+from perception.records import InputError, NoOverlapError, NoPathError
 from scenarios.commands.console import (
     common_options,
     out_option,
@@ -103,22 +103,20 @@ def command(out: Path, quiet: bool, verbose: bool, picture: bool, **options: Any
     set_verbosity(quiet, verbose)
     given = Given(**options)
     _refuse_mixed(given)
-    limits = read_limits(given)
     out = prepare_out(out)
     _clear(out)
-    config = {
-        **{k: v for k, v in options.items() if v not in (None, ())},
-        "vehicle": _table(limits),
-    }
+    config: dict[str, Any] = {k: v for k, v in options.items() if v not in (None, ())}
     began = time.perf_counter()
     with progress_bars(quiet) as progress:
         try:
+            limits = read_limits(given)
+            config["vehicle"] = _table(limits)
             if given.survey is not None:
                 return _survey(given, limits, out, config, began, quiet, picture)
             if given.old_route is not None:
                 return _replan(given, limits, out, config, began, quiet)
             plan, more = _route(given, limits, progress)
-        except InputError as error:
+        except (InputError, NoOverlapError) as error:
             _write_unsolved(out, str(error), config, given.seed, time.perf_counter() - began)
             raise
         seconds = time.perf_counter() - began

@@ -72,8 +72,9 @@ def command(
     measured: dict[str, float] = {}
     with progress_bars(quiet) as progress:
         survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
-        for warning in survey.warnings:
-            click.echo(f"note: {warning}", err=True)
+        if not quiet:
+            for warning in survey.warnings:
+                click.echo(f"note: {warning}", err=True)
 
         def write(index: int, result: PassResult) -> None:
             write_strip(out / f"strip-{index:03d}.nc", result.strip, survey.utc)

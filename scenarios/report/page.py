@@ -91,7 +91,7 @@ def write_report(folder: Path) -> Path:
                 f"{folder}: holds no metrics.json and no stage folder ({', '.join(STAGES)}); "
                 "give the --out folder of another command"
             )
-        sections = [_section(folder, folder.name)]
+        sections = [_section(folder, folder.resolve().name)]
     path = folder / "report.html"
     write_text(path, _render(folder, metrics, sections))
     return path
@@ -157,7 +157,7 @@ def _render(folder: Path, metrics: dict[str, Any], sections: list[Section]) -> s
         sections=sections,
         # A mission's own pictures; a single stage's are in its section.
         pictures=[_picture(p) for p in sorted(folder.glob("*.png"))]
-        if sections[0].name != folder.name
+        if sections[0].name != folder.resolve().name
         else [],
         headline=_numbers(metrics) if len(sections) > 1 or sections[0].name in STAGES else [],
         versions=metrics.get("versions", versions()),
