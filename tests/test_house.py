@@ -103,3 +103,12 @@ def test_no_file_holds_a_path_of_one_machine():
         if path.suffix in {".py", ".md", ".toml", ".txt", ".html"} and path.exists():
             text = path.read_text(encoding="utf-8")
             assert not re.search(r"/(work|root|home)/\w", text), f"{name} names a machine's path"
+
+
+def test_every_link_of_the_pages_leads_somewhere():
+    for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]:
+        text = page.read_text(encoding="utf-8")
+        assert "@@" not in text, f"{page.name} has a gap to fill"
+        for target in re.findall(r"\]\(([^)#\s]+)", text):
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.name} points to {target}"
