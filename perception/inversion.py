@@ -398,13 +398,13 @@ def _dark(state: _State, first: bool) -> list[BoolArray]:
 
 
 def _caution(state: _State, rows: Rows) -> float:
-    """Return the step's caution: a quarter where many cells are seen along crossing directions.
+    """Return the step's caution: none where many cells are seen along crossing directions.
 
     There a gain cannot pass for a slope, and steps may be longer.
     """
     crossed = crossing(rows, state.shape)
     seen = np.unique(rows.cell).size
-    return state.config.caution * (0.25 if float(np.sum(crossed)) > 0.1 * seen else 1.0)
+    return state.config.caution * (0.0 if float(np.sum(crossed)) > 0.1 * seen else 1.0)
 
 
 def _times(spectrum: Spectrum, factor: float) -> Spectrum:
@@ -467,7 +467,7 @@ def _linearise(state: _State, rows: Rows, first: bool) -> _Data:
     scale = _scale_by_angle(residual, rows.angle_rad)
     # Residuals of the first pass are the relief itself: there the width is given, not measured.
     sigma = np.full(len(residual), 0.35) if first else np.maximum(scale, config.least_sigma)
-    unit = residual if first else residual / (2.5 * sigma)
+    unit = residual if first else residual / (2.5 * np.maximum(scale, 0.1))
     weight = rows.share**2 / (1 + unit**2) / sigma**2
     weight[rows.ground_m < config.nadir * rows.drop_m] = 0.0
     lever = np.maximum(rows.ground_m - rows.drop_m * rows.slope, 0.3 * rows.ground_m)
@@ -547,11 +547,11 @@ def _sample_sigma(problem: Problem, state: _State, rng: np.random.Generator) -> 
 def _honest_sigma(state: _State, joint: FloatArray, alone: FloatArray) -> FloatArray:
     """Return the sigma of the map, and hold the map to what the soundings allow.
 
-    A height further from the soundings' surface than three of its sigmas is no finding but a failure
+    A height further from the soundings' surface than four of its sigmas is no finding but a failure
     of the model: it is drawn back, and its sigma is that of the soundings.
     """
     base = state.surface if state.base is None else state.base
-    limit = 3 * alone
+    limit = 4 * alone
     beyond = np.abs(state.surface - base) > limit
     state.surface = np.clip(state.surface, base - limit, base + limit)
     # The lead of the first returns shifts the whole map; it is known to about a half.

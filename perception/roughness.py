@@ -17,8 +17,8 @@ from perception.posterior import Spectrum
 from perception.rays import Soundings
 from perception.records import FloatArray
 
-# Rounds of sounding random floors; the correction settles in three.
-_ROUNDS = 3
+# Rounds of sounding random floors; the correction settles in five.
+_ROUNDS = 5
 _RANDOM_CELLS = 768
 
 
@@ -44,8 +44,7 @@ def learn_roughness(
         # Beyond a quarter of the random floor's width its periodic waves say nothing.
         usable = np.isfinite(sounded) & (lag < _RANDOM_CELLS * cell_m / 8)
         factor = np.where(usable, seen / np.where(usable, sounded, 1.0), 1.0)
-        # Half a step in log: the response of the track to roughness is less than linear.
-        target *= np.clip(factor, 0.25, 4.0) ** 0.7
+        target *= np.clip(factor, 0.25, 4.0)
         spectrum = fit_spectrum(lag, target, count, cell_m)
     return spectrum
 

@@ -1,0 +1,175 @@
+"""The linear algebra of the joint inversion against dense matrices and known statistics."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.testing import assert_allclose
+from scipy import sparse
+
+from perception.gain_basis import GainBasis
+from perception.posterior import Problem, Spectrum, prolong, restrict
+from perception.rays import Soundings
+from perception.roughness import fit_spectrum, learn_roughness, random_floor, structure_function
+from perception.soundings import bilinear_rows, sounding_equations
+
+
+def small_problem(rng: np.random.Generator) -> Problem:
+    shape = (9, 17)
+    n = 400
+    knot = np.stack([rng.integers(0, 3, n), np.full(n, 3)], axis=1)
+    points = rng.uniform(1, 7, (20, 2))
+    return Problem(
+        cell_m=0.7,
+        shape=shape,
+        cell=rng.integers(0, 8 * 16, n),
+        weight=rng.uniform(1, 20, n),
+        c_east=rng.normal(0, 4, n),
+        c_north=rng.normal(0, 4, n),
+        c_level=rng.normal(0, 0.1, n),
+        value=rng.normal(0, 0.5, n),
+        knot=knot,
+        share=np.tile([0.6, 0.4], (n, 1)),
+        gain_precision=np.eye(5) * 0.1,
+        rows=bilinear_rows(points[:, 0], points[:, 1], np.ones(20), shape),
+        row_weight=np.full(20, 100.0),
+        row_value=rng.normal(0, 1, 20),
+        height=Spectrum(0.01, 0.5, 3.0),
+        albedo=Spectrum(0.1, 1.0, 2.0),
+        mean_height=np.full(shape, 0.3),
+    )
+
+
+def dense(problem: Problem) -> np.ndarray:
+    """Return the normal matrix by applying the operator to every unit vector."""
+    nodes = problem.shape[0] * problem.shape[1]
+    size = 2 * nodes + len(problem.gain_precision)
+    out = np.empty((size, size))
+    for k in range(size):
+        unit = np.zeros(size)
+        unit[k] = 1
+        z, a, g = problem.apply(
+            unit[:nodes].reshape(problem.shape),
+            unit[nodes : 2 * nodes].reshape(problem.shape),
+            unit[2 * nodes :],
+        )
+        out[:, k] = np.concatenate([z.ravel(), a.ravel(), g])
+    return out
+
+
+def test_operator_is_symmetric_and_positive() -> None:
+    matrix = dense(small_problem(np.random.default_rng(1)))
+    assert_allclose(matrix, matrix.T, atol=1e-9 * np.abs(matrix).max())
+    assert np.linalg.eigvalsh(matrix)[0] > 0
+
+
+def test_solver_finds_the_dense_solution() -> None:
+    problem = small_problem(np.random.default_rng(2))
+    right = problem.right_side()
+    start = (np.zeros(problem.shape), np.zeros(problem.shape), np.zeros(5))
+    (z, a, g), steps = problem.solve(start, right, tolerance=1e-9, most=200)
+    expected = np.linalg.solve(
+        dense(problem), np.concatenate([right[0].ravel(), right[1].ravel(), right[2]])
+    )
+    found = np.concatenate([z.ravel(), a.ravel(), g])
+    assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    assert steps < 80
+
+
+def test_perturbations_spread_as_the_posterior_does() -> None:
+    """The variance of perturbed solutions is the diagonal of the inverse, within sampling error."""
+    rng = np.random.default_rng(3)
+    problem = small_problem(rng)
+    start = (np.zeros(problem.shape), np.zeros(problem.shape), np.zeros(5))
+    draws = [
+        problem.solve(start, problem.perturbation(rng), tolerance=1e-5, most=80)[0][0]
+        for _ in range(40)
+    ]
+    nodes = problem.shape[0] * problem.shape[1]
+    expected = np.sqrt(np.diag(np.linalg.inv(dense(problem)))[:nodes])
+    ratio = np.std(draws, axis=0).ravel() / expected
+    # 40 draws know a sigma to 11 %; the mean over nodes to a few per cent.
+    assert 0.93 < ratio.mean() < 1.07
+
+
+def test_restriction_is_the_transpose_of_prolongation() -> None:
+    rng = np.random.default_rng(4)
+    coarse, fine = rng.normal(size=(9, 5)), rng.normal(size=(17, 9))
+    assert np.vdot(prolong(coarse), fine) == np.float64(np.vdot(coarse, restrict(fine))) or (
+        abs(np.vdot(prolong(coarse), fine) - np.vdot(coarse, restrict(fine))) < 1e-9
+    )
+
+
+def test_bilinear_rows_read_a_plane_exactly() -> None:
+    row, col = np.array([0.25, 3.9]), np.array([1.5, 2.1])
+    r, c = np.indices((6, 5))
+    plane = 2.0 + 0.5 * r - 0.3 * c
+    assert_allclose(
+        bilinear_rows(row, col, np.ones(2), (6, 5)) @ plane.ravel(), 2 + 0.5 * row - 0.3 * col
+    )
+
+
+def test_a_sounding_on_a_slope_is_an_equation_on_the_nearest_point() -> None:
+    """On a plane dipping across the track the true plane satisfies the equation of its first return."""
+    cell, slope, up = 0.5, 0.3, 15.0
+    _, c = np.indices((81, 81))
+    plane = slope * (c * cell - 20.0)
+    least = up / np.hypot(1, slope)
+    bottom = Soundings(*(np.array([v]) for v in (20.0, 20.0, up, 0.0, least, 0.05)))
+    found = sounding_equations(plane, 0.0, 0.0, cell, bottom)
+    # The search is on steps of 1/40 of the reach: its error in slant range is millimetres.
+    assert_allclose(found.matrix @ plane.ravel(), found.value, atol=5e-3)
+
+
+def test_roughness_of_a_random_floor_is_recovered() -> None:
+    rng = np.random.default_rng(5)
+    planted = Spectrum(1e-3, 0.5, 4.0)
+    floor = random_floor(planted, 1.0, 512, rng)
+    lines = [(np.full(512, 16.0 * i), np.arange(512.0), floor[:, 16 * i]) for i in range(32)]
+    lag, value, weight = structure_function(lines, 1.0)
+    fitted = fit_spectrum(lag, value, weight, 1.0)
+    for k in (0.15, 0.5, 1.2):
+        ratio = (fitted.p0 + fitted.p1 * k**2 + fitted.p2 * k**4) / (
+            planted.p0 + planted.p1 * k**2 + planted.p2 * k**4
+        )
+        assert 0.6 < ratio < 1.7
+
+
+def test_roughness_is_learned_through_the_first_return() -> None:
+    """A first return is smoother than the floor; the learned floor is rougher than its soundings."""
+    rng = np.random.default_rng(6)
+    floor = random_floor(Spectrum(2e-3, 0.4, 2.0), 1.0, 512, rng)
+    passes = []
+    for line in range(4):
+        column = 40 + 120 * line
+        across = np.arange(-9, 10)
+        least = np.min(np.hypot(across, 15.0 - floor[:, column + across]), axis=1)
+        n = len(least)
+        passes.append(
+            Soundings(
+                np.full(n, float(column)),
+                np.arange(float(n)),
+                np.full(n, 15.0),
+                np.zeros(n),
+                least,
+                np.full(n, 0.05),
+            )
+        )
+    learned = learn_roughness(passes, 0.0, 1.0, rng)
+    lines = [(p.easting_m, p.northing_m, p.up_m - p.range_m) for p in passes]
+    naive = fit_spectrum(*structure_function(lines, 1.0), 1.0)
+    short = lambda s: s.p0 + s.p1 + s.p2  # noqa: E731
+    assert short(learned) < short(naive)
+    assert 0.4 < short(learned) / 2.402 < 2.5
+
+
+def test_gain_knots_share_one_and_curves_keep_shape() -> None:
+    basis = GainBasis(75.0)
+    angle = np.linspace(0, 1.5, 50)
+    knot, share = basis.place(angle, 30 + 0 * angle, np.zeros(50, np.int64))
+    assert_allclose(share.sum(axis=1), 2.0)
+    assert knot.max() < basis.size
+    # A bent curve costs, a straight one nearly nothing.
+    gain = np.zeros(basis.size)
+    gain[:36] = np.arange(36) * 0.1
+    assert gain @ basis.precision() @ gain < 0.5
+    assert sparse.issparse(bilinear_rows(angle, angle, angle, (4, 4)))
