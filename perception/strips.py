@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -53,6 +53,7 @@ class PassResult:
     Attributes
     ----------
     strip : heights with sigma.
+    floor : the same without the objects: what the soundings alone say.
     objects : objects and craters.
     bottom : altitude, sigma, first return, validity per ping.
     echo : (port, starboard) equalised power ratio (n, m), 1 nominal; NaN no data.
@@ -65,6 +66,7 @@ class PassResult:
     """
 
     strip: ElevationStrip
+    floor: ElevationStrip
     objects: ObjectTable
     bottom: BottomTrack
     echo: tuple[FloatArray, FloatArray]
@@ -129,7 +131,7 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
     sides = [(equalised, levels) for equalised, levels, _ in done]
     rows = [row for _, _, found in done for row in found]
     rows.sort(key=lambda row: row.ping)
-    strip = _strip(
+    strip, floor = _strip(
         swath, level, along_m, depth_m, line_m, line_sigma, sides, sample_m, rough, rows, config
     )
     flags = np.where(bottom.valid, 0, 1)
@@ -137,6 +139,7 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
         flags = flags | (np.asarray(swath.flags) << 1)
     return PassResult(
         strip=strip,
+        floor=floor,
         objects=ObjectTable.of(rows),
         bottom=level,
         echo=(sides[0][0].ratio, sides[1][0].ratio),
@@ -201,20 +204,21 @@ def _strip(
     rough: Roughness,
     rows: list[ObjectRow],
     config: StripConfig,
-) -> ElevationStrip:
-    """Lay floor, objects, echo and shadow on the strip's columns."""
+) -> tuple[ElevationStrip, ElevationStrip]:
+    """Lay floor, objects, echo and shadow on the strip's columns; return it with objects and without."""
     across = _columns(sides, sample_m, bottom.altitude_m, config.cell_m)
     distance = np.unique(np.abs(across))
     floor, sigma = floor_beside(line_m, line_sigma, along_m, distance, rough)
     at = np.searchsorted(distance, np.abs(across))
     elevation, sigma = floor[:, at], sigma[:, at]
     echo, shadow, seen = _on_columns(sides, across, bottom.altitude_m, sample_m)
+    bare, bare_sigma = (np.where(seen, v, np.nan).astype(np.float32) for v in (elevation, sigma))
     for row in rows:
         _add_object(elevation, sigma, row, across, along_m)
     # Ground in shadow was not heard: the object's own sigma at least.
     elevation = np.where(seen, elevation, np.nan)
     sigma = np.where(seen, sigma, np.nan)
-    return ElevationStrip(
+    strip = ElevationStrip(
         elevation_m=elevation.astype(np.float32),
         sigma_m=sigma.astype(np.float32),
         across_m=across,
@@ -232,6 +236,7 @@ def _strip(
         source=swath.source,
         pass_index=swath.pass_index,
     )
+    return strip, replace(strip, elevation_m=bare, sigma_m=bare_sigma)
 
 
 def _columns(

@@ -46,13 +46,14 @@ class PassSummary:
 
     Attributes
     ----------
-    strip, objects, bottom : as in `PassResult`.
+    strip, floor, objects, bottom : as in `PassResult`.
     shadow : (port, starboard) shadow masks (n, m), eight samples a byte: they are needed whole only
         while their own pass is inverted.
     n_samples : columns of the masks.
     """
 
     strip: ElevationStrip
+    floor: ElevationStrip
     objects: ObjectTable
     bottom: BottomTrack
     shadow: tuple[np.ndarray, np.ndarray]
@@ -62,7 +63,9 @@ class PassSummary:
     def of(cls, result: PassResult) -> PassSummary:
         port, starboard = (np.packbits(side == SHADOW, axis=1) for side in result.levels)
         width = result.levels[0].shape[1]
-        return cls(result.strip, result.objects, result.bottom, (port, starboard), width)
+        return cls(
+            result.strip, result.floor, result.objects, result.bottom, (port, starboard), width
+        )
 
     def masks(self) -> tuple[BoolArray, BoolArray]:
         """Return the shadow masks (n, m) of port and starboard."""
@@ -116,7 +119,8 @@ def map_survey(
     results = build_passes(survey, progress) if passes is None else tuple(passes)
     corrected = correct_survey([r.strip for r in results], fixes, progress=progress)
     track = whole_track(survey, corrected.trajectory)
-    strips = corrected.strips
+    # The joint method has shadows and shading of its own: of the strips it is held to the soundings.
+    strips = corrected.strips if method == "shadow" else _floors(results, corrected)
     grid = fuse(
         strips,
         cell_m=cell_m,
@@ -142,6 +146,22 @@ def map_survey(
 # The last survey's passes: a mission's strips and map are two commands in one process, and the same
 # echoes need not be cut twice.
 _recent: dict[tuple[object, ...], tuple[PassSummary, ...]] = {}
+
+
+def _floors(
+    results: Sequence[PassSummary], corrected: CorrectedSurvey
+) -> tuple[ElevationStrip, ...]:
+    """Return the passes' floors at the corrected poses and heights."""
+    return tuple(
+        replace(
+            strip,
+            elevation_m=result.floor.elevation_m + np.float32(height_m),
+            sigma_m=result.floor.sigma_m,
+        )
+        for result, strip, height_m in zip(
+            results, corrected.strips, corrected.height_m, strict=True
+        )
+    )
 
 
 def build_passes(
