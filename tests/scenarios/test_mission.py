@@ -77,12 +77,20 @@ def test_an_interrupted_mission_goes_on_where_it_stopped(finished):
     route = (finished / "plan" / "metrics.json").read_text()
     # As a kill in the last stage leaves it: no metrics.json on top, half of the last folder.
     (finished / "metrics.json").unlink()
-    (finished / "plan" / ".stage.json").unlink()
+    (finished / "plan" / ".stage.json").write_text('{"key": "", "seconds": 0.0}')
     run_mission(load_scenario(finished / "scenario.toml"), finished, quiet=True)
     assert (finished / "map" / "map.tif").stat().st_mtime_ns == made, "the map was not made again"
     assert (finished / "map" / "map.tif").read_bytes() == before
     again = json.loads((finished / "plan" / "metrics.json").read_text())
     assert again["cost"] == json.loads(route)["cost"]
+
+
+def test_a_folder_that_no_mission_wrote_is_not_replaced(finished, tmp_path, capsys):
+    (tmp_path / "map").mkdir()
+    (tmp_path / "map" / "map.tif").write_text("a survey's result")
+    outcome = run_command(capsys, "run", finished / "scenario.toml", "--out", tmp_path)
+    assert outcome.status == 1 and "no mission wrote" in outcome.complaint
+    assert (tmp_path / "map" / "map.tif").read_text() == "a survey's result"
 
 
 def test_the_shadow_method_maps_the_same_ground(finished, tmp_path, capsys):
