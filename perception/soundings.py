@@ -35,59 +35,6 @@ def both(first: Equations, second: Equations) -> Equations:
     )
 
 
-# Misfit in sigmas at which a sounding counts half.
-_DOUBT = 8.0
-# The floor's nearest point is searched within this part of the range to either side: a slope of 35
-# degrees.
-_REACH = 0.7
-
-
-def sounding_equations(
-    surface: FloatArray,
-    west_m: float,
-    south_m: float,
-    cell_m: float,
-    bottom: Soundings,
-    below: bool = False,
-    lead_m: FloatArray | float = 0.0,
-    lead_sigma_m: float = 0.0,
-) -> Equations:
-    """Return the bottom track as equations on the surface.
-
-    The slant range to the surface's nearest point equals the first return. With `below` the point is
-    taken below the sonar, as a surface not yet known is. `lead_m` and `lead_sigma_m` tell by how
-    much the first return precedes that of the smooth surface, see `perception.first_return`.
-    """
-    if below:
-        across: FloatArray = np.zeros(len(bottom.range_m))
-        height: FloatArray = bottom.up_m - bottom.range_m
-    else:
-        across, height = nearest_points(surface, west_m, south_m, cell_m, bottom)
-    east = bottom.easting_m + np.cos(bottom.heading_rad) * across
-    north = bottom.northing_m - np.sin(bottom.heading_rad) * across
-    drop = bottom.up_m - height
-    slant = np.hypot(across, drop)
-    factor = -drop / slant
-    matrix = bilinear_rows(
-        (north - south_m) / cell_m, (east - west_m) / cell_m, factor, surface.shape
-    )
-    variance = bottom.sigma_m**2 + lead_sigma_m**2
-    misfit = bottom.range_m + lead_m - slant
-    # A track that slipped off the floor for a while must not drag the surface along; on the first
-    # surface, which it made itself, it cannot be told.
-    doubt = 1.0 if below else 1 + misfit**2 / (_DOUBT**2 * variance)
-    return Equations(matrix, 1 / (variance * doubt), misfit + factor * height)
-
-
-def both(first: Equations, second: Equations) -> Equations:
-    """Return two sets of equations as one."""
-    return Equations(
-        sparse.csr_matrix(sparse.vstack([first.matrix, second.matrix])),
-        np.concatenate([first.weight, second.weight]),
-        np.concatenate([first.value, second.value]),
-    )
-
-
 # The floor's nearest point is searched within this part of the range to either side: a slope of 35
 # degrees.
 _REACH = 0.7

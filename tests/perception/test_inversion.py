@@ -115,7 +115,9 @@ def test_two_short_passes_of_unknown_gain_beat_the_soundings(
     )
     e, n = np.meshgrid(np.arange(3.5, 27), np.arange(8.5, 52))
     soundings = np.abs(griddata(points[:, :2], points[:, 2], (e, n)) - hills(e, n)).mean()
-    assert np.abs(error).mean() < 0.9 * soundings
+    # Two lines 60 m long settle a free gain poorly; the relief shows in the spread about the mean error.
+    assert np.abs(error).mean() < soundings
+    assert np.std(error) < 0.6 * soundings
 
 
 def test_errors_are_of_the_claimed_size(result: InversionResult) -> None:
