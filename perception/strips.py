@@ -130,7 +130,9 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
         done = list(pool.map(one_side, (-1, 1), (port, starboard)))
     sides = [(equalised, levels) for equalised, levels, _ in done]
     rows = [row for _, _, found in done for row in found]
-    rows.sort(key=lambda row: row.ping)
+    # A fit may run off the image it was made on: what lies past the swath was not seen.
+    reach_m = float(np.sqrt(max(reach**2 - float(np.median(altitude_m)) ** 2, 0.0)))
+    rows = sorted((r for r in rows if abs(r.across_m) <= reach_m), key=lambda row: row.ping)
     strip, floor = _strip(
         swath, level, along_m, depth_m, line_m, line_sigma, sides, sample_m, rough, rows, config
     )

@@ -52,7 +52,9 @@ def mission_stages(scenario: Scenario, out: Path) -> list[Stage]:
     if scenario.map.prior:
         options += ["--prior", str(simulated / "prior.tif")]
     stages.append(Stage("map", ("map", *survey, *options)))
-    stages.append(Stage("regions", ("regions", str(map_tif))))
+    scale = scenario.regions.scale_m
+    size = () if scale is None else ("--scale", repr(scale))
+    stages.append(Stage("regions", ("regions", str(map_tif), *size)))
     stages.append(Stage("locate", _locate_line(scenario, out)))
     stages.append(Stage("plan", _plan_line(scenario, out)))
     return stages
@@ -70,6 +72,9 @@ def _locate_line(scenario: Scenario, out: Path) -> tuple[str, ...]:
     simulated = out / "simulate"
     ground = simulated / "prior.tif" if scenario.locate.map == "prior" else out / "map" / "map.tif"
     line = ["locate", "--map", str(ground), "--nav", str(simulated / "nav.csv")]
+    if scenario.locate.map == "prior" and scenario.prior.correlated_sigma_m > 0:
+        # What is known of a prior map's making comes with it, as a survey report would tell.
+        line += ["--map-error-length", repr(scenario.prior.correlated_length_m)]
     if scenario.locate.side_scan and scenario.locate.track == "return":
         line += ["--swath", str(simulated / "return.xtf")]
     return tuple(line)

@@ -274,6 +274,14 @@ class MapSection(Section):
     fixes: bool = Field(default=True, description="whether the surface fixes are used")
 
 
+class RegionsSection(Section):
+    """Options of `bathynav regions`."""
+
+    scale_m: float | None = Field(
+        None, gt=0, description="size of the landforms that count, m; the noise's if absent"
+    )
+
+
 class LocateSection(Section):
     """The return: the run that `bathynav locate` follows, and its options."""
 
@@ -340,6 +348,7 @@ class Scenario(Section):
     mission: MissionSection = MissionSection()
     prior: PriorSection = PriorSection()
     map: MapSection = MapSection()
+    regions: RegionsSection = RegionsSection()
     locate: LocateSection = LocateSection()
     plan: PlanSection = PlanSection()
 
