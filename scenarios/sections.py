@@ -278,7 +278,7 @@ class RegionsSection(Section):
     """Options of `bathynav regions`."""
 
     scale_m: float | None = Field(
-        None, gt=0, description="size of the landforms that count, m; the noise's if absent"
+        default=None, gt=0, description="size of the landforms that count, m; the noise's if absent"
     )
 
 
