@@ -20,6 +20,11 @@ _RANGE_KNOTS = 21
 _ANGLE_BEND = 0.15
 _RANGE_BEND = 0.08
 _LEVEL = 30.0
+# 1-sigma of the first difference between knots: 0.9 dB in 3 degrees, 0.4 dB from range to range. Without it
+# beam pattern and range gain run off against each other by tens of dB, and take the relief along.
+_ANGLE_RISE = 0.2
+_RANGE_RISE = 0.1
+_RANGE_LEVEL = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +41,15 @@ class GainBasis:
         """Return the prior's precision matrix (size, size)."""
         out = np.zeros((self.size, self.size))
         parts = (
-            (0, _ANGLE_KNOTS, _ANGLE_BEND, _LEVEL),
-            (_ANGLE_KNOTS, _ANGLE_KNOTS, _ANGLE_BEND, _LEVEL),
-            (2 * _ANGLE_KNOTS, _RANGE_KNOTS, _RANGE_BEND, 1.0),
+            (0, _ANGLE_KNOTS, _ANGLE_BEND, _ANGLE_RISE, _LEVEL),
+            (_ANGLE_KNOTS, _ANGLE_KNOTS, _ANGLE_BEND, _ANGLE_RISE, _LEVEL),
+            (2 * _ANGLE_KNOTS, _RANGE_KNOTS, _RANGE_BEND, _RANGE_RISE, _RANGE_LEVEL),
         )
-        for first, count, bend, level in parts:
+        for first, count, bend, rise, level in parts:
             second = np.diff(np.eye(count), 2, axis=0)
-            block = second.T @ second / bend**2 + np.eye(count) / level**2
+            slope = np.diff(np.eye(count), 1, axis=0)
+            block = second.T @ second / bend**2 + slope.T @ slope / rise**2
+            block += np.eye(count) / level**2
             out[first : first + count, first : first + count] = block
         return out
 

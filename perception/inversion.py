@@ -416,13 +416,26 @@ def _held_profiles(state: _State, single: BoolArray, lit: BoolArray) -> Equation
     if state.base is None:
         # Once the first returns' lead is known: the surface of the soundings alone.
         state.base = _sounding_surface(state)
-    if float(np.sum(single)) < _MOSTLY_ONE_SIDED * float(np.sum(lit)):
-        single = np.zeros_like(single)
-    spread = float(np.std(state.soundings.up_m - state.soundings.range_m))
-    return mean_profiles(
-        state.base, state.west_m, state.south_m, state.cell_m, state.rays,
-        single, max(0.1 * spread, 0.02),
-    )  # fmt: skip
+    bottom = state.soundings
+    spread = float(np.std(bottom.up_m - bottom.range_m))
+    frame = (state.base, state.west_m, state.south_m, state.cell_m, state.rays)
+    if float(np.sum(single)) >= _MOSTLY_ONE_SIDED * float(np.sum(lit)):
+        return mean_profiles(*frame, single, max(0.1 * spread, 0.02))
+    # Means over a line of independent stretches: the longer the line, the less may its profile rise.
+    length = float(np.median([_length(ray) for ray in state.rays]))
+    stretches = max(length / (2 * _correlation_length(state.roughness, length)), 1.0)
+    return mean_profiles(*frame, lit & ~single, spread / np.sqrt(stretches), relative=True)
+
+
+def _length(ray: Rays) -> float:
+    return float(np.hypot(np.ptp(ray.easting_m), np.ptp(ray.northing_m)))
+
+
+def _correlation_length(roughness: Spectrum, longest_m: float) -> float:
+    """Return the mean inverse wave number of the heights' variance, of waves that fit a line, metres."""
+    k = np.geomspace(2 * np.pi / longest_m, 10, 400)
+    power = k / (roughness.p0 + roughness.p1 * k**2 + roughness.p2 * k**4)
+    return float(np.trapezoid(power / k, k) / np.trapezoid(power, k))
 
 
 def _learn_lead(state: _State, rows: Rows, rng: np.random.Generator) -> None:

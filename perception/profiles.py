@@ -57,14 +57,16 @@ def mean_profiles(
     rays: Sequence[Rays],
     single: BoolArray,
     sigma_m: float,
+    relative: bool = False,
 ) -> Equations:
     """Return equations that hold mean heights by pass, side and ground range to those of `base`.
 
     Parameters
     ----------
     base : (rows, cols) surface of the soundings alone.
-    single : (rows - 1, cols - 1) where the ground is seen from one side only.
+    single : (rows - 1, cols - 1) ground whose mean is held.
     sigma_m : 1-sigma of a mean.
+    relative : hold the rise of the mean from below the track, not the mean itself.
     """
     parts: list[sparse.csr_matrix] = []
     stretch = _STRETCH_CELLS * cell_m
@@ -86,7 +88,17 @@ def mean_profiles(
         gather = sparse.csr_matrix(
             (np.ones(len(group)), (group, np.arange(len(group)))), shape=(len(ground), len(group))
         )
-        parts.append(sparse.csr_matrix((gather @ points)[np.flatnonzero(number > 3)]))
+        means = sparse.csr_matrix((gather @ points)[np.flatnonzero(number > 3)])
+        if relative and means.shape[0]:
+            below = bilinear_rows(
+                np.clip((ray.northing_m - south_m) / cell_m, 0, base.shape[0] - 1.001),
+                np.clip((ray.easting_m - west_m) / cell_m, 0, base.shape[1] - 1.001),
+                np.full(len(ray.easting_m), 1.0 / len(ray.easting_m)),
+                base.shape,
+            )
+            track = sparse.csr_matrix(np.ones((means.shape[0], below.shape[0])) @ below)
+            means = sparse.csr_matrix(means - track)
+        parts.append(means)
     if not parts:
         return Equations(sparse.csr_matrix((0, base.size)), np.zeros(0), np.zeros(0))
     matrix = sparse.csr_matrix(sparse.vstack(parts))
