@@ -5,12 +5,11 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from perception.files import existing_file, write_text
+from perception.files import existing_file, utc_seconds, write_text
 from perception.records import InputError
 
 _FIX_COLUMNS = ("time", "easting_m", "northing_m", "sigma_m")
@@ -71,7 +70,7 @@ def read_fixes(path: Path) -> list[PositionFix]:
 
 def _fix_of_row(path: Path, line: int, row: dict[str, str]) -> PositionFix:
     try:
-        time_s = _utc_seconds(row["time"])
+        time_s = utc_seconds(row["time"])
         easting_m, northing_m, sigma_m = (float(row[c]) for c in _FIX_COLUMNS[1:])
     except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: line {line}: {error}; mend or remove the line") from error
@@ -80,13 +79,6 @@ def _fix_of_row(path: Path, line: int, row: dict[str, str]) -> PositionFix:
     if not (np.isfinite(sigma_m) and sigma_m > 0):
         raise InputError(f"{path}: line {line}: sigma_m must be positive, got {sigma_m}")
     return PositionFix(time_s, easting_m, northing_m, sigma_m**2, 0.0, sigma_m**2, kind="absolute")
-
-
-def _utc_seconds(text: str) -> float:
-    moment = datetime.fromisoformat(text.strip())
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC)
-    return moment.timestamp()
 
 
 def write_fixes(path: Path, fixes: Sequence[PositionFix]) -> None:

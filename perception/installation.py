@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from perception.corrections import (
     with_tow,
     without_latency,
 )
-from perception.files import existing_file, read_toml
+from perception.files import existing_file, read_toml, utc_seconds
 from perception.records import InputError
 
 # Sound in water: beyond these a figure is a slip of unit or column.
@@ -213,7 +212,7 @@ def _sound(text: str, folder: Path = Path()) -> dict[str, Any]:
 
 def read_tide(path: Path) -> Table:
     """Read a tide table: CSV with `time` (ISO 8601, UTC unless it says otherwise) and `height_m`."""
-    return _read_table(path, "time", "height_m", _utc_seconds)
+    return _read_table(path, "time", "height_m", utc_seconds)
 
 
 def read_profile(path: Path) -> Table:
@@ -250,11 +249,6 @@ def _read_table(path: Path, at: str, value: str, parse: Callable[[str], float]) 
         raise InputError(f"{path}: holds no row; it must have {at} and {value}")
     where, what = np.array(sorted(points)).T
     return Table(where, what, str(path))
-
-
-def _utc_seconds(text: str) -> float:
-    moment = datetime.fromisoformat(text.strip())
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 _SECTIONS: dict[str, type] = {
