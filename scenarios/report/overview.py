@@ -13,10 +13,6 @@ from perception.files import whole_file
 from perception.records import FloatArray, Grid, Trajectory
 from scenarios.plots_survey import shaded_relief
 
-_CLASS_COLOURS = (
-    "#ffffff", "#b2182b", "#2166ac", "#ef8a62", "#67a9cf", "#fddbc7", "#d1e5f0", "#f2f2f2", "#c2a5cf",
-)  # fmt: skip
-
 
 def plot_overview(out: Path, path: Path) -> None:
     """Draw the mission in `out` (all stages done) into `path`."""
@@ -119,17 +115,17 @@ def _regions(axes: Any, folder: Path, grid: Grid) -> None:
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
+    from mapping.region_files import CLASS_COLOURS
     from perception.records import REGION_CLASSES
 
     with rasterio.open(folder / "regions.tif") as source:
         classes = source.read(1)
     axes.imshow(
-        classes, cmap=ListedColormap(_CLASS_COLOURS), vmin=-0.5, vmax=8.5,
+        classes, cmap=ListedColormap(["#ffffff", *CLASS_COLOURS.values()]), vmin=-0.5, vmax=8.5,
         extent=_extent_from(grid, grid), interpolation="nearest",
     )  # fmt: skip
     handles = [
-        Patch(color=colour, label=name)
-        for colour, name in zip(_CLASS_COLOURS[1:], REGION_CLASSES[1:], strict=True)
+        Patch(color=colour, label=REGION_CLASSES[code]) for code, colour in CLASS_COLOURS.items()
     ]
     axes.legend(
         handles=handles,
