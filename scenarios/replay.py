@@ -14,6 +14,9 @@ from perception.records import FloatArray, Grid, InputError, Trajectory
 
 _SHADES = " .:-=+*#%@"  # low to high ground
 _TRACK, _VEHICLE = "o", "V"
+LEGEND = (
+    f"{_SHADES[1]} low to {_SHADES[-1]} high ground   {_TRACK} track so far   {_VEHICLE} vehicle"
+)
 
 
 @dataclass(frozen=True, slots=True)

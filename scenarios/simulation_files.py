@@ -27,15 +27,18 @@ def write_simulation(simulation: Simulation, out: Path, progress: Progress = sil
     steps = 6
     progress("writing", 0, steps)
     write_text(out / "scenario.toml", tomli_w.dumps(tree_of(scenario)))
-    _write_survey(simulation, out, to_file)
+    written = _write_survey(simulation, out, to_file)
     progress("writing", 1, steps)
     if simulation.back is not None:
+        written.append("return.xtf")
         write_xtf(out / "return.xtf", _log(scenario, simulation.back, to_file, slice(None)))
     progress("writing", 2, steps)
     write_text(out / "nav.csv", _nav_csv(simulation.nav, to_file))
     write_text(out / "surface-fixes.csv", _fixes_csv(simulation.fixes))
     if scenario.navigation.tide_amplitude_m > 0:
+        written.append("tide.csv")
         write_text(out / "tide.csv", _tide_csv(simulation))
+    _remove_earlier(out, written)
     write_map(out / "prior.tif", simulation.prior)
     progress("writing", 3, steps)
     truth = out / "truth"
@@ -50,17 +53,32 @@ def write_simulation(simulation: Simulation, out: Path, progress: Progress = sil
     progress("writing", steps, steps)
 
 
-def _write_survey(simulation: Simulation, out: Path, to_file: FileFrame) -> None:
+def _remove_earlier(out: Path, written: list[str]) -> None:
+    """Remove an earlier simulation's files that this one has no counterpart of.
+
+    A survey is read by the pattern survey*.xtf: a file left over would be taken for a line of it.
+    """
+    for pattern in ("survey.xtf", "survey-[0-9]*.xtf", "return.xtf", "tide.csv"):
+        for path in out.glob(pattern):
+            if path.name not in written:
+                path.unlink()
+
+
+def _write_survey(simulation: Simulation, out: Path, to_file: FileFrame) -> list[str]:
+    """Write the sonar files and return their names."""
     scenario, survey = simulation.scenario, simulation.survey
     if scenario.mission.files == "one":
         write_xtf(out / "survey.xtf", _log(scenario, survey, to_file, slice(None)))
-        return
+        return ["survey.xtf"]
     # A turn that is recorded belongs to the line before it.
     line = np.maximum.accumulate(survey.truth.line)
+    names = []
     for number in np.unique(line):
         rows = np.flatnonzero(line == number)
         log = _log(scenario, survey, to_file, slice(rows[0], rows[-1] + 1))
-        write_xtf(out / f"survey-{int(number) + 1:03d}.xtf", log)
+        names.append(f"survey-{int(number) + 1:03d}.xtf")
+        write_xtf(out / names[-1], log)
+    return names
 
 
 def _log(scenario: Scenario, pinged: Pinged, to_file: FileFrame, rows: slice) -> SonarLog:

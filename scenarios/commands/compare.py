@@ -40,3 +40,10 @@ def command(a: Path, b: Path, quiet: bool, verbose: bool) -> None:
     for line in lines:
         cells = (t.ljust(w) for t, w in zip(line, widths, strict=True))
         click.echo("  ".join(cells).rstrip())
+    if not any(math.isfinite(r.p_value) for r in rows) and not quiet:
+        click.echo(
+            "no significance: these are single runs; run both as experiments of several seeds "
+            "(bathynav experiment) to tell a difference from chance"
+            if all(r.pairs == 0 and not math.isfinite(r.low) for r in rows)
+            else "no significance: no metric differs within the pairs, or there is one pair alone"
+        )

@@ -39,7 +39,14 @@ def set_verbosity(quiet: bool, verbose: bool) -> None:
 
 
 def prepare_out(out: Path) -> Path:
-    """Make the output folder and prove that it can be written, before any work is done."""
+    """Make the output folder and prove that it can be written, before any work is done.
+
+    A command that fails leaves no empty folder of its own making behind.
+    """
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    context = click.get_current_context(silent=True)
+    if context is not None:
+        context.call_on_close(lambda: _remove_empty(made))
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".bathynav-probe"
@@ -51,6 +58,14 @@ def prepare_out(out: Path) -> Path:
             "give --out a folder that can be written"
         ) from error
     return out
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders, innermost first, as far as they are empty."""
+    for folder in folders:
+        if not folder.is_dir() or any(folder.iterdir()):
+            return
+        folder.rmdir()
 
 
 @contextmanager

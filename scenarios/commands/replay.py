@@ -21,7 +21,7 @@ _FRAMES_A_SECOND = 10
 @common_options
 def command(folder: Path, seconds: float, quiet: bool, verbose: bool) -> None:
     """Play the vehicle's track over the map; in a pipe, print ten moments as lines."""
-    from scenarios.replay import find_mission, frames
+    from scenarios.replay import LEGEND, find_mission, frames
 
     set_verbosity(quiet, verbose)
     grid, track = find_mission(folder)
@@ -34,9 +34,9 @@ def command(folder: Path, seconds: float, quiet: bool, verbose: bool) -> None:
     from rich.text import Text
 
     console = Console()
-    rows, columns = max(console.height - 3, 5), max(console.width - 1, 20)
+    rows, columns = max(console.height - 4, 5), max(console.width - 1, 20)
     n_frames = max(2, round(seconds * _FRAMES_A_SECOND))
     with Live(console=console, auto_refresh=False) as live:
         for frame in frames(grid, track, columns, rows, n_frames):
-            live.update(Text("\n".join((*frame.lines, frame.caption))), refresh=True)
+            live.update(Text("\n".join((*frame.lines, frame.caption, LEGEND))), refresh=True)
             time.sleep(seconds / n_frames)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import click
 
+from scenarios.commands.console import common_options, set_verbosity
+
 
 @click.command()
 @click.argument("name", required=False)
-def command(name: str | None) -> None:
+@common_options
+def command(name: str | None, quiet: bool, verbose: bool) -> None:
     """List the named scenarios; with a NAME, print that scenario's file to start one's own from."""
     from perception.records import InputError
     from scenarios.schema import library, load_scenario
 
+    set_verbosity(quiet, verbose)
     named = library()
     if name is not None:
         if name not in named:

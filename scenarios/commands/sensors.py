@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import click
 
+from scenarios.commands.console import common_options, set_verbosity
+
 
 @click.command()
-def command() -> None:
+@common_options
+def command(quiet: bool, verbose: bool) -> None:
     """List the sonars and sensors with their figures, and the formats of sonar files."""
     from perception.sonars import SENSORS, SONARS
 
+    set_verbosity(quiet, verbose)
     header = (
         "sonar", "kind", "kHz", "beam deg", "tilt deg", "range m", "cell cm", "sector deg", "image s",
     )  # fmt: skip

@@ -108,7 +108,11 @@ def _section(folder: Path, name: str) -> Section:
         pictures=[_picture(p) for p in pictures[:_FIRST]],
         more_pictures=[_picture(p) for p in pictures[_FIRST:]],
         metrics=_numbers(metrics),
-        files=[p.name for p in sorted(folder.iterdir()) if p.is_file() and p.suffix != ".png"],
+        files=[
+            p.name
+            for p in sorted(folder.iterdir())
+            if p.is_file() and p.suffix != ".png" and not p.name.startswith(".")
+        ],
     )
 
 

@@ -258,3 +258,12 @@ def test_a_picture_is_drawn_on_request_beside_the_truth(tmp_path, run):
     status, printed, _ = run("simulate", str(tmp_path / "s.toml"), "--out", str(out), "--picture")
     assert status == 0 and "pings" in printed
     assert (out / "truth/simulation.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_files_of_an_earlier_simulation_are_not_left_to_be_read_as_lines_of_this_one(tmp_path):
+    many = tiny("demo", mission={"files": "per-line"}, navigation={"tide_amplitude_m": 0.5})
+    out = written(many, tmp_path)
+    assert len(list(out.glob("survey-*.xtf"))) == 2 and (out / "tide.csv").exists()
+    written(tiny("demo", mission={"files": "one"}, navigation={"tide_amplitude_m": 0.0}), tmp_path)
+    assert [p.name for p in out.glob("*.xtf")] == ["survey.xtf"]
+    assert not (out / "tide.csv").exists()

@@ -1,0 +1,40 @@
+"""What every command shares: the output folder."""
+
+import click
+from click.testing import CliRunner
+
+from perception.records import InputError
+from scenarios.commands import scenarios as scenarios_command
+from scenarios.commands import sensors as sensors_command
+from scenarios.commands.console import out_option, prepare_out
+
+
+@click.command()
+@out_option
+@click.option("--fail", is_flag=True)
+def working(out, fail):
+    prepare_out(out)
+    if fail:
+        raise InputError("no")
+    (out / "result.txt").write_text("there")
+
+
+def test_a_command_that_fails_leaves_no_empty_folder_behind(tmp_path):
+    out = tmp_path / "deep" / "out"
+    CliRunner().invoke(working, ["--out", str(out), "--fail"])
+    assert not (tmp_path / "deep").exists()
+
+
+def test_a_folder_that_was_there_before_stays_even_when_empty(tmp_path):
+    CliRunner().invoke(working, ["--out", str(tmp_path), "--fail"])
+    assert tmp_path.is_dir()
+
+
+def test_a_folder_with_results_stays(tmp_path):
+    CliRunner().invoke(working, ["--out", str(tmp_path / "out")])
+    assert (tmp_path / "out" / "result.txt").read_text() == "there"
+
+
+def test_lists_take_the_common_options():
+    for module in (scenarios_command, sensors_command):
+        assert CliRunner().invoke(module.command, ["-q"]).exit_code == 0
