@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,10 @@ import numpy.typing as npt
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.transform import Affine
+from rasterio.windows import Window
 
 from perception.files import existing_file, whole_file
-from perception.records import Grid, InputError
+from perception.records import FloatArray, Grid, InputError
 
 _SIGMA_NAMES = ("sigma", "uncertainty", "std", "stddev", "standard deviation")
 _ELEVATION_NAMES = ("elevation", "bathymetry", "height", "z", "topo", "depth")
@@ -38,17 +41,103 @@ def read_map(path: Path, sigma_m: float | None = None) -> Grid:
     InputError
         Not a raster, no georeference, rotated, geographic (degrees), or without a single height.
     """
+    with open_map(path, sigma_m) as opened:
+        return opened.read_whole()
+
+
+@contextmanager
+def open_map(path: Path, sigma_m: float | None = None) -> Iterator[OpenMap]:
+    """Open a map too large to hold, to be read by windows; arguments and refusals of `read_map`."""
     path = existing_file(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(_main_subdataset(path)) as source:
-                return _grid_of(source, path, sigma_m)
+                yield _opened(source, path, sigma_m)
     except RasterioError as error:
         raise InputError(
             f"{path}: GDAL cannot read it as a raster ({error}); "
             "give a GeoTIFF, BAG, NetCDF or ASC grid"
         ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class OpenMap:
+    """An open map file: which band means what, and the georeference.
+
+    Attributes
+    ----------
+    elevation_band, sigma_band, count_band : numbers from 1; None where the file has none.
+    down : whether the band of heights holds depths.
+    sigma_m : 1-sigma that the caller gave for the whole map; None takes the file's.
+    sigma_beside : name of another variable of the same NetCDF that holds the sigma; empty none.
+    """
+
+    path: Path
+    source: Any
+    elevation_band: int
+    down: bool
+    sigma_band: int | None
+    count_band: int | None
+    sigma_m: float | None
+    sigma_beside: str
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return int(self.source.height), int(self.source.width)
+
+    def read_whole(self) -> Grid:
+        """Read all of the map.
+
+        Raises
+        ------
+        InputError
+            It holds no height at all.
+        """
+        grid = self.read()
+        if not np.isfinite(grid.elevation_m).any():
+            raise InputError(
+                f"{self.path}: band {self.elevation_band} holds no height at all "
+                "(every cell is nodata or NaN)"
+            )
+        return replace(grid, sigma_m=_known(grid.sigma_m), count=_known(grid.count))
+
+    def read(self, rows: slice | None = None, cols: slice | None = None) -> Grid:
+        """Read a window of whole cells; a band of sigma stays even where it is empty."""
+        window = None
+        west, north, transform = (
+            self.source.transform.c,
+            self.source.transform.f,
+            self.source.transform,
+        )
+        if rows is not None and cols is not None:
+            window = Window(cols.start, rows.start, cols.stop - cols.start, rows.stop - rows.start)
+            west, north = west + cols.start * transform.a, north + rows.start * transform.e
+        elevation_m = _read_band(self.source, self.elevation_band, window)
+        if self.down:
+            elevation_m = -elevation_m
+        sigma: npt.NDArray[np.float64] | None = None
+        if self.sigma_m is not None:
+            sigma = np.where(np.isfinite(elevation_m), float(self.sigma_m), np.nan)
+        elif self.sigma_band is not None:
+            sigma = _read_band(self.source, self.sigma_band, window)
+        elif self.sigma_beside:
+            with rasterio.open(self.sigma_beside) as beside:
+                sigma = _read_band(beside, 1, window)
+        square = np.isclose(transform.a, -transform.e, rtol=1e-9)
+        return Grid(
+            elevation_m=elevation_m,
+            west_m=west,
+            north_m=north,
+            cell_m=transform.a,
+            cell_height_m=None if square else -transform.e,
+            crs=self.source.crs.to_string() if self.source.crs else "",
+            sigma_m=sigma,
+            count=None
+            if self.count_band is None
+            else _read_band(self.source, self.count_band, window),
+            datum=self.source.tags().get("VERTICAL_DATUM", ""),
+        )
 
 
 def _main_subdataset(path: Path) -> str:
@@ -64,37 +153,20 @@ def _main_subdataset(path: Path) -> str:
     return str(names[0])
 
 
-def _grid_of(source: Any, path: Path, sigma_m: float | None) -> Grid:
+def _opened(source: Any, path: Path, sigma_m: float | None) -> OpenMap:
     _refuse_unusable_frame(source, path)
     descriptions = _descriptions(source)
     elevation_band = _band_named(descriptions, _ELEVATION_NAMES) or 1
-    elevation_m = _read_band(source, elevation_band)
-    if _points_down(source, elevation_band, descriptions[elevation_band - 1]):
-        elevation_m = -elevation_m
-    if not np.isfinite(elevation_m).any():
-        raise InputError(
-            f"{path}: band {elevation_band} holds no height at all (every cell is nodata or NaN)"
-        )
     sigma_band = _band_named(descriptions, _SIGMA_NAMES)
-    sigma = None
-    if sigma_m is not None:
-        sigma = np.where(np.isfinite(elevation_m), float(sigma_m), np.nan)
-    elif sigma_band is not None:
-        sigma = _known(_read_band(source, sigma_band))
-    else:
-        sigma = _sibling_sigma(source, path)
-    count_band = _band_named(descriptions, ("count",))
-    transform = source.transform
-    return Grid(
-        elevation_m=elevation_m,
-        west_m=transform.c,
-        north_m=transform.f,
-        cell_m=transform.a,
-        cell_height_m=None if np.isclose(transform.a, -transform.e, rtol=1e-9) else -transform.e,
-        crs=source.crs.to_string() if source.crs else "",
-        sigma_m=sigma,
-        count=None if count_band is None else _known(_read_band(source, count_band)),
-        datum=source.tags().get("VERTICAL_DATUM", ""),
+    return OpenMap(
+        path=path,
+        source=source,
+        elevation_band=elevation_band,
+        down=_points_down(source, elevation_band, descriptions[elevation_band - 1]),
+        sigma_band=sigma_band,
+        count_band=_band_named(descriptions, ("count",)),
+        sigma_m=sigma_m,
+        sigma_beside="" if sigma_band is not None else _sibling_sigma(source, path),
     )
 
 
@@ -115,10 +187,10 @@ def _points_down(source: Any, band: int, name: str) -> bool:
     return name.startswith("depth")
 
 
-def _sibling_sigma(source: Any, path: Path) -> npt.NDArray[np.float64] | None:
-    """Return the sigma that stands beside the heights as another variable of a NetCDF; None none."""
+def _sibling_sigma(source: Any, path: Path) -> str:
+    """Return the name of the sigma that stands beside the heights in a NetCDF; empty none."""
     if not str(source.name).lower().startswith("netcdf:"):
-        return None
+        return ""
     with rasterio.open(path) as whole:
         names = list(whole.subdatasets)
     for wanted in _SIGMA_NAMES:
@@ -126,13 +198,13 @@ def _sibling_sigma(source: Any, path: Path) -> npt.NDArray[np.float64] | None:
             if name.rsplit(":", 1)[-1].strip("/").lower() == wanted:
                 with rasterio.open(name) as beside:
                     if beside.shape == source.shape:
-                        return _known(_read_band(beside, 1))
-    return None
+                        return str(name)
+    return ""
 
 
-def _known(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:
+def _known(values: FloatArray | None) -> FloatArray | None:
     """Return a band, or None where it is there in name only: some makers leave uncertainty empty."""
-    return values if np.isfinite(values).any() else None
+    return None if values is None or not np.isfinite(values).any() else values
 
 
 def _refuse_unusable_frame(source: Any, path: Path) -> None:
@@ -174,8 +246,8 @@ def _band_named(descriptions: Sequence[str], names: Sequence[str]) -> int | None
     return None
 
 
-def _read_band(source: Any, band: int) -> npt.NDArray[np.float64]:
-    values = source.read(band, masked=True).astype(np.float64)
+def _read_band(source: Any, band: int, window: Window | None = None) -> npt.NDArray[np.float64]:
+    values = source.read(band, window=window, masked=True).astype(np.float64)
     scale, offset = source.scales[band - 1], source.offsets[band - 1]
     filled: npt.NDArray[np.float64] = values.filled(np.nan) * scale + offset
     filled[~np.isfinite(filled)] = np.nan
