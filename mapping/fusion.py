@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from mapping.gridding import Window
+from mapping.placed import PassRaster, PlacedStrip, boxes, extent, on_window, placed
 from perception.records import (
     BoolArray,
     ElevationStrip,
@@ -22,28 +22,8 @@ from perception.records import (
 
 # A cell's height from one pass this many sigma from the other passes' mean is an outlier.
 _OUTLIER_SIGMA = 4.0
-# Lines farther apart than this many usual steps have a gap between them, which is not bridged.
-_GAP_STEPS = 4.0
-
-
-@dataclass(frozen=True, slots=True)
-class PassRaster:
-    """One strip on the common lattice: cell (row, col) of it is lattice cell (row0 + row, col0 + col).
-
-    `height_m`, `variance_m2`, `count` (rows, cols); NaN and 0 no data. Rows run south to north.
-    """
-
-    row0: int
-    col0: int
-    height_m: FloatArray
-    variance_m2: FloatArray
-    position_m2: FloatArray
-    count: FloatArray
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        rows, cols = self.height_m.shape
-        return slice(self.row0, self.row0 + rows), slice(self.col0, self.col0 + cols)
+# Cells that a map in one piece may have: some 100 bytes each, passes included. Beyond it, `mapping.tiles`.
+LARGEST_MAP = 400_000_000
 
 
 def default_cell(strips: Sequence[ElevationStrip]) -> float:
@@ -93,25 +73,45 @@ def fuse(
     """
     crs = _common_crs(strips, crs)
     cell = default_cell(strips) if cell_m is None else float(cell_m)
-    lattice = _lattice(strips, cell)
+    sigma_m = np.zeros(len(strips)) if height_sigma_m is None else height_sigma_m
+    there = [
+        placed(strip, trajectory, float(one)) for strip, one in zip(strips, sigma_m, strict=True)
+    ]
+    window = map_window(there, cell)
     rasters = []
-    for index, strip in enumerate(strips):
-        offset = 0.0 if height_sigma_m is None else float(height_sigma_m[index])
-        rasters.append(
-            _rasterise(strip, cell, lattice, _position_variance(strip, trajectory), offset)
-        )
+    for index, strip in enumerate(there):
+        rasters.append(on_window(strip, boxes(strip, cell), cell, window))
         progress("fusing strips", index + 1, len(strips))
-    west, south, cols, rows = lattice
-    mean, sigma, count = combine([r for r in rasters if r is not None], (rows, cols), cell)
+    shape = (window.rows, window.cols)
+    mean, sigma, count = combine([r for r in rasters if r is not None], shape, cell)
     return Grid(
         elevation_m=mean[::-1],
-        west_m=west * cell,
-        north_m=(south + rows) * cell,
+        west_m=window.col * cell,
+        north_m=(window.row + window.rows) * cell,
         cell_m=cell,
         crs=crs,
         sigma_m=sigma[::-1],
         count=count[::-1],
     )
+
+
+def map_window(strips: Sequence[PlacedStrip], cell_m: float, most: int = LARGEST_MAP) -> Window:
+    """Return the cells of the map, refusing sizes that make no sense.
+
+    Raises
+    ------
+    InputError
+        No strip holds a height, or the map would have more than `most` cells.
+    """
+    window = extent(strips, cell_m)
+    if window is None:
+        raise InputError("no strip holds a single height; was the bottom found in any ping?")
+    if window.rows * window.cols > most:
+        raise InputError(
+            f"the map would have {window.rows} x {window.cols} cells of {cell_m} m; give a larger "
+            "--cell, or --tiles to make it tile by tile"
+        )
+    return window
 
 
 def _common_crs(strips: Sequence[ElevationStrip], crs: str | None) -> str:
@@ -128,143 +128,6 @@ def _common_crs(strips: Sequence[ElevationStrip], crs: str | None) -> str:
             f"the strips lie in {names[0]}, not in {crs}; read the survey with --crs {crs}"
         )
     return crs or names[0]
-
-
-def _lattice(strips: Sequence[ElevationStrip], cell: float) -> tuple[int, int, int, int]:
-    """Return west and south in whole cells and the number of columns and rows."""
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for strip in strips:
-        seen = np.isfinite(strip.elevation_m)
-        if not seen.any():
-            continue
-        for axis, values in enumerate(strip.positions()):
-            low[axis] = min(low[axis], float(values[seen].min()))
-            high[axis] = max(high[axis], float(values[seen].max()))
-    first = np.floor(low / cell).astype(int)
-    last = np.floor(high / cell).astype(int)
-    cols, rows = (last - first + 1).tolist()
-    if cols * rows > 4e8:
-        raise InputError(
-            f"the map would have {rows} x {cols} cells of {cell} m; give a larger --cell"
-        )
-    return int(first[0]), int(first[1]), cols, rows
-
-
-def _position_variance(strip: ElevationStrip, trajectory: Trajectory | None) -> FloatArray:
-    """Return (n,) mean variance of the horizontal position per axis at each line; 0 unknown."""
-    if trajectory is None or trajectory.ping is None:
-        return np.zeros(len(strip.ping))
-    order = np.argsort(trajectory.ping)
-    variance = 0.5 * (trajectory.sigma_easting_m**2 + trajectory.sigma_northing_m**2)
-    return np.interp(strip.ping, trajectory.ping[order], np.nan_to_num(variance[order]))
-
-
-def _rasterise(
-    strip: ElevationStrip,
-    cell: float,
-    lattice: tuple[int, int, int, int],
-    position_m2: FloatArray,
-    offset_sigma_m: float,
-) -> PassRaster | None:
-    seen = np.isfinite(strip.elevation_m) & (strip.sigma_m > 0)
-    if not seen.any():
-        return None
-    east, north = (values[seen] for values in strip.positions())
-    col0, row0 = int(np.floor(east.min() / cell)), int(np.floor(north.min() / cell))
-    cols = int(np.floor(east.max() / cell)) - col0 + 1
-    rows = int(np.floor(north.max() / cell)) - row0 + 1
-    step = np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))
-    usual = float(np.median(step)) if len(step) else cell
-    across = float(np.median(np.diff(strip.across_m))) if len(strip.across_m) > 1 else cell
-    # At 0.6 of a cell a slanting lattice of samples leaves no cell empty.
-    weight, height, variance, position, count = bin_strip(
-        np.where(seen, strip.elevation_m, np.nan), strip.sigma_m, strip.easting_m - col0 * cell,
-        strip.northing_m - row0 * cell, strip.heading_rad, strip.across_m, position_m2, cell, rows, cols,
-        max(1, math.ceil(usual / (0.6 * cell))), max(1, math.ceil(across / (0.6 * cell))),
-        max(_GAP_STEPS * usual, 1e-6),
-    )  # fmt: skip
-    filled = weight > 0
-    safe = np.where(filled, weight, 1.0)
-    return PassRaster(
-        row0=row0 - lattice[1],
-        col0=col0 - lattice[0],
-        height_m=np.where(filled, height / safe, np.nan),
-        variance_m2=np.where(filled, variance / safe + offset_sigma_m**2, np.nan),
-        position_m2=np.where(filled, position / safe, 0.0),
-        count=count,
-    )
-
-
-@numba.njit(cache=True)
-def bin_strip(
-    height: FloatArray,
-    sigma: FloatArray,
-    east: FloatArray,
-    north: FloatArray,
-    heading: FloatArray,
-    across: FloatArray,
-    position_m2: FloatArray,
-    cell: float,
-    rows: int,
-    cols: int,
-    along_parts: int,
-    across_parts: int,
-    gap_m: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Sum weights 1/sigma^2 and weighted height, sigma^2, position variance; count the data.
-
-    Between neighbouring samples `along_parts` x `across_parts` points are interpolated so that no cell
-    inside the strip stays empty; the count holds the samples alone.
-    """
-    weight = np.zeros((rows, cols))
-    w_height = np.zeros((rows, cols))
-    w_variance = np.zeros((rows, cols))
-    w_position = np.zeros((rows, cols))
-    count = np.zeros((rows, cols))
-    n, m = height.shape
-    for i in range(n):
-        i1 = min(i + 1, n - 1)
-        parts = along_parts
-        if i1 == i or np.hypot(east[i1] - east[i], north[i1] - north[i]) > gap_m:
-            parts = 1
-        for a in range(parts):
-            fa = a / parts
-            h = heading[i] + fa * np.arctan2(
-                np.sin(heading[i1] - heading[i]), np.cos(heading[i1] - heading[i])
-            )
-            c, s = np.cos(h), np.sin(h)
-            e0 = east[i] + fa * (east[i1] - east[i])
-            n0 = north[i] + fa * (north[i1] - north[i])
-            for j in range(m):
-                for b in range(across_parts):
-                    fb = b / across_parts
-                    j1 = min(j + 1, m - 1)
-                    z, var = 0.0, 0.0
-                    z += (1 - fa) * (1 - fb) * height[i, j]
-                    var += (1 - fa) * (1 - fb) * sigma[i, j] ** 2
-                    if fa > 0:
-                        z += fa * (1 - fb) * height[i1, j]
-                        var += fa * (1 - fb) * sigma[i1, j] ** 2
-                    if fb > 0:
-                        z += (1 - fa) * fb * height[i, j1]
-                        var += (1 - fa) * fb * sigma[i, j1] ** 2
-                    if fa > 0 and fb > 0:
-                        z += fa * fb * height[i1, j1]
-                        var += fa * fb * sigma[i1, j1] ** 2
-                    if not (var > 0 and z == z):
-                        continue
-                    x = across[j] + fb * (across[j1] - across[j])
-                    col = int(np.floor((e0 + c * x) / cell))
-                    row = int(np.floor((n0 - s * x) / cell))
-                    if 0 <= row < rows and 0 <= col < cols:
-                        w = 1.0 / var
-                        weight[row, col] += w
-                        w_height[row, col] += w * z
-                        w_variance[row, col] += 1.0
-                        w_position[row, col] += w * position_m2[i]
-                        if a == 0 and b == 0:
-                            count[row, col] += 1.0
-    return weight, w_height, w_variance, w_position, count
 
 
 def combine(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mapping.fusion import bin_strip
+from mapping.gridding import Spacing, Window, bin_lines
 from mapping.graph_files import read_g2o
 from mapping.keyframes import Keyframes
 from mapping.pose_graph import Link, solve
@@ -162,9 +162,10 @@ def _gridding(n: int = 10_000_000) -> list[Row]:
     nothing = np.zeros(lines)
 
     def ours() -> Any:
-        return bin_strip(
-            height, sigma, east, north, heading, across, nothing, 1.0, side, side, 1, 1, 1.0
-        )
+        return bin_lines(
+            height, sigma, east, north, heading, across, nothing, Spacing(1, 1, 1.0), 1.0,
+            Window(0, 0, side, side), (0, 0),
+        )  # fmt: skip
 
     ours()
     x = east[:, None] + np.cos(heading)[:, None] * across
@@ -178,7 +179,7 @@ def _gridding(n: int = 10_000_000) -> list[Row]:
 
     case = "10 million soundings, 1 m cells"
     return [
-        Row(case, "bin_strip, from poses to five sums", "time", _seconds(ours, 2), "s",
+        Row(case, "bin_lines, from poses to five sums", "time", _seconds(ours, 2), "s",
             "<= 2 x bincount"),
         Row(case, "numpy bincount x 2, cells known", "time", _seconds(bare, 2), "s"),
     ]  # fmt: skip

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapping.fusion import bin_strip, default_cell, fuse
+from mapping.fusion import default_cell, fuse
+from mapping.gridding import COUNT, HEIGHT, WEIGHT, Spacing, Window, bin_lines
 from mapping.mosaic import echo_mosaic
 from mapping.objects import merge_objects, write_objects
 from mapping.quality import crossing_differences, survey_quality
@@ -105,19 +106,20 @@ def test_binning_equals_bincount() -> None:
     rng = np.random.default_rng(0)
     strip = a_strip(heading_deg=20.0)
     height = strip.elevation_m + rng.normal(size=strip.elevation_m.shape)
-    cell, rows, cols = 1.0, 80, 80
-    east, north = strip.easting_m - ORIGIN[0], strip.northing_m - ORIGIN[1]
-    weight, total, _, _, count = bin_strip(
-        height, strip.sigma_m, east, north, strip.heading_rad, strip.across_m,
-        np.zeros(len(east)), cell, rows, cols, 1, 1, 10.0,
+    rows, cols = 80, 80
+    row0, col0 = int(ORIGIN[1]), int(ORIGIN[0])
+    sums = bin_lines(
+        height, strip.sigma_m, strip.easting_m, strip.northing_m, strip.heading_rad, strip.across_m,
+        np.zeros(len(height)), Spacing(1, 1, 10.0), 1.0, Window(row0, col0, rows, cols), (row0, col0),
     )  # fmt: skip
     e, n = strip.positions()
     index = np.floor(n - ORIGIN[1]).astype(int) * cols + np.floor(e - ORIGIN[0]).astype(int)
     inside = (e - ORIGIN[0] >= 0) & (e - ORIGIN[0] < cols) & (n - ORIGIN[1] >= 0)
     expected = np.bincount(index[inside], height[inside] / 0.04, minlength=rows * cols)
-    np.testing.assert_allclose(total.ravel(), expected, rtol=1e-9)
-    np.testing.assert_allclose(count.ravel(), np.bincount(index[inside], minlength=rows * cols))
-    np.testing.assert_allclose(weight, count / 0.04)
+    np.testing.assert_allclose(sums[..., HEIGHT].ravel(), expected, rtol=1e-9)
+    number = np.bincount(index[inside], minlength=rows * cols)
+    np.testing.assert_allclose(sums[..., COUNT].ravel(), number)
+    np.testing.assert_allclose(sums[..., WEIGHT].ravel(), number / 0.04)
 
 
 def test_the_default_cell_follows_the_resolution() -> None:
