@@ -13,6 +13,8 @@ from perception.records import ElevationStrip, InputError
 if TYPE_CHECKING:
     import xarray
 
+CHUNK_LINES = 128
+
 # variable: (dimensions, units, long name, standard name or "")
 _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "elevation_m": (("line", "column"), "m", "height of the sea floor above the vertical datum", ""),
@@ -65,7 +67,9 @@ def strip_dataset(strip: ElevationStrip, utc: bool = True) -> xarray.Dataset:
 def write_strip(path: Path, strip: ElevationStrip, utc: bool = True) -> None:
     """Write a strip to `path` (NetCDF-4), whole or not at all."""
     data = strip_dataset(strip, utc)
-    squeezed = {"zlib": True, "complevel": 1}
+    # Chunks of whole lines: a tile of the map reads the lines that touch it, not the strip.
+    lines, columns = strip.elevation_m.shape
+    squeezed = {"zlib": True, "complevel": 1, "chunksizes": (min(lines, CHUNK_LINES), columns)}
     encoding = {
         name: squeezed for name, (dimensions, *_) in _VARIABLES.items() if len(dimensions) == 2
     }
