@@ -254,6 +254,6 @@ def _inside(start: float, slope: float, size: int, across: FloatArray) -> tuple[
         return 0, m - 1
     one, two = (-0.01 - start) / slope, (size + 0.01 - start) / slope
     low, high = min(one, two), max(one, two)
-    first = max(np.searchsorted(across, low) - 1, 0)
-    last = min(np.searchsorted(across, high, side="right"), m) - 1
+    first = max(int(np.searchsorted(across, low)) - 1, 0)
+    last = min(int(np.searchsorted(across, high, side="right")), m) - 1
     return first, last

@@ -151,9 +151,9 @@ def boxes(strip: PlacedStrip, cell_m: float) -> list[tuple[int, int, Window]]:
         part = slice(first, min(last + 1, n))
         if not np.isfinite(reach[part]).any():
             continue
-        turn = np.diff(strip.heading_rad[part])
-        turn = float(np.abs(np.angle(np.exp(1j * turn))).max()) if len(turn) else 0.0
-        bulge = float(np.nanmax(np.abs(reach[part]))) * (1 - np.cos(min(turn, np.pi) / 2))
+        turns = np.abs(np.angle(np.exp(1j * np.diff(strip.heading_rad[part]))))
+        turn = float(turns.max()) if len(turns) else 0.0
+        bulge = float(np.nanmax(np.abs(reach[part]))) * (1 - float(np.cos(turn / 2)))
         low = [np.nanmin(north[part]) - bulge, np.nanmin(east[part]) - bulge]
         high = [np.nanmax(north[part]) + bulge, np.nanmax(east[part]) + bulge]
         # A cell more on each side, for rounding.
@@ -170,14 +170,12 @@ def on_window(
     blocks: Sequence[tuple[int, int, Window]],
     cell_m: float,
     window: Window,
-    rows: Rows | None = None,
 ) -> PassRaster | None:
     """Return what a strip says of the cells of a window; None where it says nothing.
 
     Parameters
     ----------
     blocks : the strip's `boxes`.
-    rows : other values to grid than the strip's heights (its echoes).
     """
     touching = [(first, last, box) for first, last, box in blocks if box.common(window)]
     if not touching:
@@ -188,7 +186,7 @@ def on_window(
     spacing = spacing_of(strip.easting_m, strip.northing_m, strip.across_m, cell_m)
     sums = np.zeros((part.rows, part.cols, 5))
     for first, last in _runs(touching, len(strip.easting_m)):
-        height, sigma = (rows or strip.rows)(first, last)
+        height, sigma = strip.rows(first, last)
         lines = slice(first, last)
         bin_lines(
             height, sigma, strip.easting_m[lines], strip.northing_m[lines],

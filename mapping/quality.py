@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import shapely
@@ -19,7 +19,7 @@ S44_ORDERS = {
     "2": (1.0, 0.023, 20.0, 0.10),
 }
 # 95 % of a normal error in one dimension lies within 1.96 sigma, of a circular one within 2.45.
-_ONE_D_95, _TWO_D_95 = 1.96, 2.45
+ONE_D_95, TWO_D_95 = 1.96, 2.45
 
 
 def crossings(strips: Sequence[ElevationStrip]) -> FloatArray:
@@ -85,31 +85,37 @@ def survey_quality(
     Coverage: mapped area, part of the bounding rectangle, data per cell. The tables of S-44 ask for
     feature detection and coverage too, which a number cannot promise: the order here is of uncertainty alone.
     """
-    difference, sigma = crossing_differences(strips)
-    figures: dict[str, float | int | str | None] = {"crossings": len(difference)}
-    if len(difference):
-        figures["crossing_bias_m"] = float(difference.mean())
-        figures["crossing_rms_m"] = float(np.sqrt((difference**2).mean()))
-        figures["crossing_within_2_sigma"] = float((np.abs(difference) <= 2 * sigma).mean())
+    figures = crossing_figures(strips)
     mapped = np.isfinite(grid.elevation_m)
     area = grid.cell_m * grid.cell_north_m
     figures["mapped_m2"] = float(mapped.sum() * area)
     figures["coverage_of_rectangle"] = float(mapped.mean())
     if grid.count is not None and mapped.any():
         figures["median_data_per_cell"] = float(np.nanmedian(grid.count[mapped]))
-    horizontal = _horizontal_95(trajectory)
+    horizontal = horizontal_95(trajectory)
     figures["track_horizontal_95_m"] = horizontal
     figures.update(_orders(grid, horizontal))
     return figures
 
 
-def _horizontal_95(trajectory: Trajectory | None) -> float | None:
+def crossing_figures(strips: Sequence[ElevationStrip]) -> dict[str, float | int | str | None]:
+    """Return the figures of the tracks' crossings alone."""
+    difference, sigma = crossing_differences(strips)
+    figures: dict[str, float | int | str | None] = {"crossings": len(difference)}
+    if len(difference):
+        figures["crossing_bias_m"] = float(difference.mean())
+        figures["crossing_rms_m"] = float(np.sqrt((difference**2).mean()))
+        figures["crossing_within_2_sigma"] = float((np.abs(difference) <= 2 * sigma).mean())
+    return figures
+
+
+def horizontal_95(trajectory: Trajectory | None) -> float | None:
     """Return the horizontal uncertainty that 95 % of the track's poses keep, at 95 % each."""
     if trajectory is None:
         return None
     variance = 0.5 * (trajectory.sigma_easting_m**2 + trajectory.sigma_northing_m**2)
     known = variance[np.isfinite(variance)]
-    return float(_TWO_D_95 * np.sqrt(np.percentile(known, 95))) if len(known) else None
+    return float(TWO_D_95 * np.sqrt(np.percentile(known, 95))) if len(known) else None
 
 
 def _orders(grid: Grid, horizontal_m: float | None) -> dict[str, float | int | str | None]:
@@ -120,13 +126,28 @@ def _orders(grid: Grid, horizontal_m: float | None) -> dict[str, float | int | s
     if not known.any():
         return figures
     depth = np.maximum(-grid.elevation_m[known], 0.0)
-    vertical = _ONE_D_95 * grid.sigma_m[known]
-    met = "none"
-    for order, (a, b, c, d) in reversed(S44_ORDERS.items()):
-        share = float((vertical <= np.hypot(a, b * depth)).mean())
-        figures[f"s44_{order}_vertical_share"] = share
-        allowed = c + d * float(np.median(depth))
-        if share >= 0.95 and horizontal_m is not None and horizontal_m <= allowed:
-            met = order
-    figures["s44_order_of_uncertainty"] = met
+    vertical = ONE_D_95 * grid.sigma_m[known]
+    shares = {
+        order: float((vertical <= np.hypot(a, b * depth)).mean())
+        for order, (a, b, _, _) in S44_ORDERS.items()
+    }
+    figures |= {f"s44_{order}_vertical_share": share for order, share in reversed(shares.items())}
+    figures["s44_order_of_uncertainty"] = order_met(shares, float(np.median(depth)), horizontal_m)
     return figures
+
+
+def order_met(shares: Mapping[str, float], depth_m: float, horizontal_m: float | None) -> str:
+    """Return the strictest order that 95 % of cells meet vertically and the track horizontally.
+
+    Parameters
+    ----------
+    shares : part of the cells that meets each of `S44_ORDERS` vertically.
+    depth_m : typical depth, for the horizontal limit.
+    horizontal_m : the track's horizontal uncertainty at 95 %; None unknown.
+    """
+    if horizontal_m is None:
+        return "none"
+    for order, (_, _, c, d) in S44_ORDERS.items():
+        if shares[order] >= 0.95 and horizontal_m <= c + d * depth_m:
+            return order
+    return "none"

@@ -1,0 +1,244 @@
+"""The plan of a tiled map: lattice, tiles and placed strips, on disk for whoever makes a tile."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+
+from mapping.fusion import map_window
+from mapping.gridding import Window
+from mapping.placed import PlacedStrip, boxes
+from perception.files import existing_file, whole_file
+from perception.records import FloatArray, InputError
+
+# Part of every tile's key: raise it when the same strips would give another map.
+_METHOD = 1
+# A tile of 1,024 cells holds some 40 MB of sums while it is made, and 12 MB in the store.
+TILE_CELLS = 1024
+# Lattices beyond this are a mistake of units rather than a survey.
+_MOST_CELLS = 10**13
+_POSES = ("easting_m", "northing_m", "heading_rad", "position_m2", "altitude_m")
+
+
+@dataclass(frozen=True, slots=True)
+class StripFile:
+    """A strip as `perception.strip_files` writes it, whose rows are read when they are wanted.
+
+    Attributes
+    ----------
+    path : NetCDF file with `elevation_m`, `sigma_m` and `echo` (lines, columns).
+    digest : of the file's content: what was made of it stays true while this does.
+    """
+
+    path: Path
+    digest: str
+
+    @classmethod
+    def of(cls, path: Path) -> StripFile:
+        """Return the file with its digest, reading it once."""
+        with existing_file(path).open("rb") as stream:
+            return cls(Path(path), hashlib.file_digest(stream, "blake2b").hexdigest()[:32])
+
+    def rows(self, first: int, last: int, names: Sequence[str]) -> tuple[FloatArray, ...]:
+        """Return the named variables of lines first to last - 1, NaN where there is no data."""
+        try:
+            with netCDF4.Dataset(self.path) as data:
+                data.set_auto_mask(False)  # NaN is no data, with or without a mask
+                return tuple(np.asarray(data[name][first:last], np.float32) for name in names)
+        except (OSError, IndexError) as error:
+            raise InputError(
+                f"{self.path}: cannot be read as a strip ({error}); run the same command again to "
+                "make it anew"
+            ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class FiledStrip:
+    """A placed strip whose rows lie in a file, and the altitudes by which its echoes are weighted."""
+
+    file: StripFile
+    strip: PlacedStrip
+    altitude_m: FloatArray
+
+
+def filed(file: StripFile, strip: PlacedStrip, altitude_m: FloatArray) -> FiledStrip:
+    """Return a placed strip that takes its rows from a file."""
+
+    def rows(first: int, last: int) -> tuple[FloatArray, FloatArray]:
+        height, sigma = file.rows(first, last, ("elevation_m", "sigma_m"))
+        return height, sigma
+
+    return FiledStrip(file, replace(strip, rows=rows), np.asarray(altitude_m, float))
+
+
+@dataclass(frozen=True)
+class TilePlan:
+    """What a tiled map is made of.
+
+    Attributes
+    ----------
+    cell_m, crs, datum : frame of the map.
+    window : all cells of the map, on the lattice whose edges are multiples of the cell.
+    tile_cells : cells on a tile's side.
+    strips : in the order of the passes.
+    """
+
+    cell_m: float
+    crs: str
+    datum: str
+    window: Window
+    tile_cells: int
+    strips: tuple[FiledStrip, ...]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.window.rows, self.window.cols
+
+    @property
+    def west_m(self) -> float:
+        return self.window.col * self.cell_m
+
+    @property
+    def north_m(self) -> float:
+        return (self.window.row + self.window.rows) * self.cell_m
+
+    def tiles(self) -> list[tuple[int, int]]:
+        """Return all tiles as (row, column), from the north-west."""
+        rows, cols = (-(-size // self.tile_cells) for size in self.shape)
+        return [(i, j) for i in range(rows) for j in range(cols)]
+
+    def slices(self, tile: tuple[int, int]) -> tuple[slice, slice]:
+        """Return where a tile lies in the map's rasters, rows from the north."""
+        starts = (tile[0] * self.tile_cells, tile[1] * self.tile_cells)
+        rows, cols = (
+            slice(start, min(start + self.tile_cells, size))
+            for start, size in zip(starts, self.shape, strict=True)
+        )
+        return rows, cols
+
+    def core(self, tile: tuple[int, int]) -> Window:
+        """Return a tile's cells on the lattice."""
+        rows, cols = self.slices(tile)
+        south = self.window.row + self.window.rows - rows.stop
+        return Window(
+            south, self.window.col + cols.start, rows.stop - rows.start, cols.stop - cols.start
+        )
+
+    def outer(self, tile: tuple[int, int], halo: int = 1) -> Window:
+        """Return a tile's cells with those around it that its own depend on, within the map."""
+        grown = self.core(tile).grown(halo).common(self.window)
+        assert grown is not None
+        return grown
+
+    @cached_property
+    def boxes(self) -> list[list[tuple[int, int, Window]]]:
+        """The blocks of lines of each strip, and the cells they may touch."""
+        return [boxes(one.strip, self.cell_m) for one in self.strips]
+
+    def touching(self, tile: tuple[int, int]) -> list[int]:
+        """Return the strips that a tile is made of, in order."""
+        outer = self.outer(tile)
+        return [
+            index
+            for index, blocks in enumerate(self.boxes)
+            if any(box.common(outer) for _, _, box in blocks)
+        ]
+
+    def key(self, tile: tuple[int, int]) -> str:
+        """Return the digest of all that decides a tile's content."""
+        digest = hashlib.blake2b(digest_size=16)
+        core, outer = self.core(tile), self.outer(tile)
+        digest.update(repr((_METHOD, self.cell_m, core, outer)).encode())
+        for index in self.touching(tile):
+            digest.update(self._digests[index])
+        return digest.hexdigest()
+
+    @cached_property
+    def _digests(self) -> list[bytes]:
+        return [_digest(one) for one in self.strips]
+
+
+def _digest(one: FiledStrip) -> bytes:
+    """Return the digest of a strip: its rows, where it lies, how high and how sure."""
+    digest = hashlib.blake2b(one.file.digest.encode(), digest_size=16)
+    digest.update(repr((one.strip.height_m, one.strip.height_sigma_m)).encode())
+    for array in (*_poses(one).values(), one.strip.across_m, one.strip.reach_m):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.digest()
+
+
+def plan_tiles(
+    strips: Sequence[FiledStrip],
+    cell_m: float,
+    crs: str,
+    datum: str = "",
+    tile_cells: int = TILE_CELLS,
+) -> TilePlan:
+    """Lay tiles over all that the strips saw.
+
+    Raises
+    ------
+    InputError
+        No strip holds a height, or the lattice has more cells than any survey.
+    """
+    window = map_window([one.strip for one in strips], cell_m, _MOST_CELLS)
+    return TilePlan(float(cell_m), crs, datum, window, int(tile_cells), tuple(strips))
+
+
+def _poses(one: FiledStrip) -> dict[str, FloatArray]:
+    return {
+        name: one.altitude_m if name == "altitude_m" else getattr(one.strip, name)
+        for name in _POSES
+    }
+
+
+def save_plan(path: Path, plan: TilePlan) -> None:
+    """Write a plan for the workers, whole or not at all."""
+    head = {
+        "cell_m": plan.cell_m, "crs": plan.crs, "datum": plan.datum, "tile_cells": plan.tile_cells,
+        "window": [plan.window.row, plan.window.col, plan.window.rows, plan.window.cols],
+        "strips": [
+            {"path": str(one.file.path.absolute()), "digest": one.file.digest,
+             "height_m": one.strip.height_m, "height_sigma_m": one.strip.height_sigma_m}
+            for one in plan.strips
+        ],
+    }  # fmt: skip
+    arrays: dict[str, Any] = {"head": np.array(json.dumps(head))}
+    for index, one in enumerate(plan.strips):
+        arrays |= {f"{index}/{name}": values for name, values in _poses(one).items()}
+        arrays |= {f"{index}/across_m": one.strip.across_m, f"{index}/reach_m": one.strip.reach_m}
+    with whole_file(path) as temporary:
+        np.savez(temporary, **arrays)
+
+
+def load_plan(path: Path) -> TilePlan:
+    """Read what `save_plan` wrote."""
+    with np.load(path, allow_pickle=False) as data:
+        head = json.loads(str(data["head"]))
+        strips = [
+            _strip_of(said, {name: data[f"{index}/{name}"] for name in (*_POSES, "across_m", "reach_m")})
+            for index, said in enumerate(head["strips"])
+        ]  # fmt: skip
+    return TilePlan(
+        head["cell_m"], head["crs"], head["datum"], Window(*head["window"]), head["tile_cells"],
+        tuple(strips),
+    )  # fmt: skip
+
+
+def _strip_of(said: dict[str, Any], arrays: dict[str, FloatArray]) -> FiledStrip:
+    altitude_m = arrays.pop("altitude_m")
+    strip = PlacedStrip(
+        rows=lambda first, last: (np.empty(0), np.empty(0)),
+        height_m=said["height_m"],
+        height_sigma_m=said["height_sigma_m"],
+        **arrays,
+    )
+    return filed(StripFile(Path(said["path"]), said["digest"]), strip, altitude_m)
