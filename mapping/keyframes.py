@@ -71,7 +71,7 @@ def choose_keyframes(strips: Sequence[ElevationStrip], spacing_m: float) -> Keyf
         excess = np.where(step > _JUMP_FACTOR * max(usual, 1e-6), step, 0.0)
         jump = np.diff(np.cumsum(excess)[lines], prepend=0.0)
         way[0], jump[0] = _gap(before, strip, usual)
-        rows = (strip.easting_m, strip.northing_m, strip.heading_rad, strip.time_s)
+        rows = (*strip.sonar_positions(), strip.heading_rad, strip.time_s)
         for name, value in zip(("e", "n", "h", "t"), rows, strict=True):
             parts[name].append(value[lines])
         parts["strip"].append(np.full(len(lines), index))
@@ -79,7 +79,8 @@ def choose_keyframes(strips: Sequence[ElevationStrip], spacing_m: float) -> Keyf
         parts["way"].append(way)
         parts["jump"].append(jump)
         starts.append(starts[-1] + len(lines))
-        before = (strip.easting_m[-1], strip.northing_m[-1], strip.time_s[-1])
+        east, north = strip.sonar_positions()
+        before = (float(east[-1]), float(north[-1]), float(strip.time_s[-1]))
     joined = {name: np.concatenate(values) for name, values in parts.items()}
     return Keyframes(
         strip=joined["strip"],
@@ -96,7 +97,7 @@ def choose_keyframes(strips: Sequence[ElevationStrip], spacing_m: float) -> Keyf
 
 def _travelled(strip: ElevationStrip) -> tuple[FloatArray, FloatArray, float]:
     """Return the way since the first line (n,), each line's step, and the usual step."""
-    step = np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))
+    step = np.hypot(*(np.diff(place) for place in strip.sonar_positions()))
     step = np.concatenate([[0.0], np.nan_to_num(step)])
     usual = float(np.median(step[1:])) if len(step) > 1 else 0.0
     return np.cumsum(step), step, usual
@@ -108,7 +109,8 @@ def _gap(
     """Return the way from the strip before, and its extra 1-sigma for a jump."""
     if before is None:
         return np.nan, 0.0
-    distance = float(np.hypot(strip.easting_m[0] - before[0], strip.northing_m[0] - before[1]))
+    east, north = strip.sonar_positions()
+    distance = float(np.hypot(east[0] - before[0], north[0] - before[1]))
     seconds = float(strip.time_s[0] - before[2])
     if not 0.0 <= seconds <= _SEPARATE_DIVE_S:
         return np.nan, 0.0
@@ -171,8 +173,8 @@ def _navigation_at(
     """Return the navigation's position at a time, the way beyond the pass, and its 1-sigma there."""
     order = np.argsort(strip.time_s, kind="stable")
     times = strip.time_s[order]
-    east = float(np.interp(time_s, times, strip.easting_m[order]))
-    north = float(np.interp(time_s, times, strip.northing_m[order]))
+    places = strip.sonar_positions()
+    east, north = (float(np.interp(time_s, times, place[order])) for place in places)
     outside_s = max(times[0] - time_s, time_s - times[-1], 0.0)
     if outside_s == 0.0:
         return east, north, 0.0, 0.0
@@ -181,10 +183,7 @@ def _navigation_at(
     if seconds <= 0:
         return east, north, outside_s, outside_s
     velocity = np.array(
-        [
-            np.polyfit(times[edge] - times[edge][0], values[order][edge], 1)[0]
-            for values in (strip.easting_m, strip.northing_m)
-        ]
+        [np.polyfit(times[edge] - times[edge][0], values[order][edge], 1)[0] for values in places]
     )
     speed = float(np.hypot(*velocity)) if speed_m_s is None else speed_m_s
     shift = velocity * (time_s - np.clip(time_s, times[0], times[-1]))

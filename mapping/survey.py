@@ -109,7 +109,8 @@ class Diagnostics:
 class CorrectedSurvey:
     """Strips on corrected tracks, the track with covariance, and how it came about.
 
-    `height_sigma_m` (strips,) is the 1-sigma of each strip's height offset.
+    `height_sigma_m` (strips,) is the 1-sigma of each strip's height offset; `links` and `ties` are the
+    registrations and fixes of the last graph (`pose_graph_files` writes it).
     """
 
     strips: tuple[ElevationStrip, ...]
@@ -120,6 +121,8 @@ class CorrectedSurvey:
     height_sigma_m: FloatArray
     keyframes: Keyframes
     solution: Solution
+    links: tuple[Link, ...] = ()
+    ties: tuple[KeyframeFix, ...] = ()
 
 
 def correct_survey(
@@ -155,10 +158,11 @@ def correct_survey(
     textures: dict[int, Texture] = {}
     rounds: list[Round] = []
     found: list[Registration] = []
+    links: list[Link] = []
     for number in range(config.rounds):
         corrected = _apply(thin, keyframes, solution)
         windows = find_overlaps(corrected, _window_side(strips, config, number))
-        found, after = _round(
+        found, links, after = _round(
             corrected,
             textures,
             keyframes,
@@ -188,7 +192,7 @@ def correct_survey(
         # The first rounds' squares are coarse by intent: the third always pays.
         if number > 1 and (moved_m < settled_m or not rounds[-1].used):
             break
-    return _result(strips, keyframes, solution, found, rounds, config)
+    return _result(strips, keyframes, solution, found, links, ties, rounds, config)
 
 
 def known_floor(strips: Sequence[ElevationStrip]) -> Grid | None:
@@ -254,7 +258,7 @@ def _round(
     progress: Progress,
     number: int,
     floor: Grid | None,
-) -> tuple[list[Registration], Solution]:
+) -> tuple[list[Registration], list[Link], Solution]:
     """Compare the passes over every window and solve the graph with what came of it."""
     textures: dict[int, Texture] = {}
     unknown_m = None if floor is None or floor.sigma_m is None else _typical(floor.sigma_m)
@@ -301,10 +305,14 @@ def _round(
         progress(f"registering, round {number + 1}", done, len(windows))
     after = solve(keyframes, links, ties, config.graph)
     used = iter(after.link_used)
-    return [
-        Registration(window, result, bool(next(used)) if result.accepted else False)
-        for window, result in results
-    ], after
+    return (
+        [
+            Registration(window, result, bool(next(used)) if result.accepted else False)
+            for window, result in results
+        ],
+        links,
+        after,
+    )
 
 
 def _expected_shift(
@@ -446,6 +454,8 @@ def _result(
     keyframes: Keyframes,
     solution: Solution,
     found: Sequence[Registration],
+    links: Sequence[Link],
+    ties: Sequence[KeyframeFix],
     rounds: Sequence[Round],
     config: SurveyConfig,
 ) -> CorrectedSurvey:
@@ -459,10 +469,13 @@ def _result(
     covariance = np.concatenate(covariances)
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(s, name) for s in corrected])
-        for name in ("time_s", "easting_m", "northing_m", "depth_m", "heading_rad", "ping")
+        for name in ("time_s", "depth_m", "heading_rad", "ping")
     }
+    places = [strip.sonar_positions() for strip in corrected]
     trajectory = Trajectory(
         **joined,
+        easting_m=np.concatenate([east for east, _ in places]),
+        northing_m=np.concatenate([north for _, north in places]),
         sigma_easting_m=np.sqrt(covariance[:, 0, 0]),
         sigma_northing_m=np.sqrt(covariance[:, 1, 1]),
         cov_en_m2=covariance[:, 0, 1],
@@ -486,4 +499,6 @@ def _result(
         height_sigma_m=solution.height_sigma_m,
         keyframes=keyframes,
         solution=solution,
+        links=tuple(links),
+        ties=tuple(ties),
     )

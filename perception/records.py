@@ -145,6 +145,8 @@ class ElevationStrip:
     echo : (n, m) gain-equalised echo level, 1 where nominal (power ratio); NaN no data.
     shadow : (n, m) True where the sea floor lies in acoustic shadow.
     time_s, ping, easting_m, northing_m, depth_m, heading_rad, altitude_m, altitude_sigma_m : (n,).
+    lead_m : (n,) how far ahead of the sonar the line lies, by its pitch (`perception.attitude`); None
+        nowhere.
     """
 
     elevation_m: FloatArray
@@ -163,6 +165,7 @@ class ElevationStrip:
     crs: str
     source: str = ""
     pass_index: int = 0
+    lead_m: FloatArray | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.time_s), len(self.across_m))
@@ -174,9 +177,16 @@ class ElevationStrip:
                 )
         per_line = (
             "ping", "easting_m", "northing_m", "depth_m", "heading_rad", "altitude_m",
-            "altitude_sigma_m",
+            "altitude_sigma_m", "lead_m",
         )  # fmt: skip
         _check_lengths(self, per_line, len(self.time_s))
+
+    def sonar_positions(self) -> tuple[FloatArray, FloatArray]:
+        """Return easting and northing of the sonar itself, each (n,)."""
+        if self.lead_m is None:
+            return self.easting_m, self.northing_m
+        east, north = np.sin(self.heading_rad), np.cos(self.heading_rad)
+        return self.easting_m - self.lead_m * east, self.northing_m - self.lead_m * north
 
     def positions(self) -> tuple[FloatArray, FloatArray]:
         """Return easting and northing of every cell, each (n, m)."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from perception.attitude import levelled
 from perception.bottom import BottomConfig, BottomTrack, track_bottom
 from perception.contours import (
     Roughness,
@@ -99,7 +100,9 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
             f"{swath.n_pings} pings; is this a side-scan channel?"
         )
     along_m = progress_along(swath.easting_m, swath.northing_m, swath.time_s)
-    depth_m = _depth(swath)
+    # Where nothing is known of the depth there is nothing to level either.
+    swath, lead_m = levelled(replace(swath, depth_m=_depth(swath)), bottom.first_return_m)
+    depth_m = swath.depth_m
     # Heights along the line of soundings, levelled over all lines at once.
     sounded = -(depth_m + bottom.altitude_m)
     reach = sample_m * port.shape[1]
@@ -136,6 +139,7 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
     strip, floor = _strip(
         swath, level, along_m, depth_m, line_m, line_sigma, sides, sample_m, rough, rows, config
     )
+    strip, floor = (replace(s, lead_m=lead_m) for s in (strip, floor))
     flags = np.where(bottom.valid, 0, 1)
     if swath.flags is not None:
         flags = flags | (np.asarray(swath.flags) << 1)

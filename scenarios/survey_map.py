@@ -17,6 +17,7 @@ from mapping.fixes import PositionFix
 from mapping.fusion import fuse
 from mapping.one_sided import hold_one_sided
 from mapping.survey import CorrectedSurvey, correct_survey
+from perception.attitude import levelled
 from perception.bottom import BottomTrack
 from perception.levels import SHADOW
 from perception.objects import ObjectTable
@@ -139,8 +140,9 @@ def map_survey(
         held = hold_one_sided(inversion.grid, grid, strips, altitude_m)
         grid = with_pose_sigma(held, track, corrected.height_sigma_m)
     grid = replace(grid, datum=survey.datum)
-    objects = tuple(corrected_objects(p.objects, track) for p in results)
-    return SurveyMap(grid, track, navigated_track(survey), results, corrected, objects, inversion)
+    raw = navigated_track(survey)
+    objects = tuple(corrected_objects(p.objects, raw, track) for p in results)
+    return SurveyMap(grid, track, raw, results, corrected, objects, inversion)
 
 
 # The last survey's passes: a mission's strips and map are two commands in one process, and the same
@@ -288,13 +290,17 @@ def corrected_swath(swath: Swath, track: Trajectory, height_offset_m: float) -> 
     )
 
 
-def corrected_objects(table: ObjectTable, track: Trajectory) -> ObjectTable:
-    """Return objects at the places that the corrected poses of their pings give them."""
-    heading_rad = track.heading_rad[table.ping]
+def corrected_objects(table: ObjectTable, raw: Trajectory, track: Trajectory) -> ObjectTable:
+    """Return objects moved as the correction moves and turns the poses of their pings."""
+    ping = table.ping
+    before, after = raw.heading_rad[ping], track.heading_rad[ping]
+    moved_e, moved_n = (
+        track.easting_m[ping] - raw.easting_m[ping], track.northing_m[ping] - raw.northing_m[ping],
+    )  # fmt: skip
     return replace(
         table,
-        easting_m=track.easting_m[table.ping] + np.cos(heading_rad) * table.across_m,
-        northing_m=track.northing_m[table.ping] - np.sin(heading_rad) * table.across_m,
+        easting_m=table.easting_m + moved_e + (np.cos(after) - np.cos(before)) * table.across_m,
+        northing_m=table.northing_m + moved_n - (np.sin(after) - np.sin(before)) * table.across_m,
     )
 
 
@@ -341,8 +347,9 @@ def _look(
         flags=None,
     )
     port, starboard = result.masks()
+    placed = corrected_swath(swath, track, float(corrected.height_m[index]))
     return Look(
-        swath=corrected_swath(swath, track, float(corrected.height_m[index])),
+        swath=levelled(placed, result.bottom.first_return_m)[0],
         altitude_m=np.where(result.bottom.valid, result.bottom.first_return_m, np.nan),
         altitude_sigma_m=result.bottom.sigma_m,
         shadow_port=port,
