@@ -8,7 +8,7 @@ A sounding's residual is its elevation less the map's. Its variance has three pa
   not count the same error as news each time, so it is inflated by the number of soundings that share
   it, ``n = 1 + 2 L / d`` with d the way between two updates (an AR(1) sequence of correlation
   exp(-d/L) tells n times less of its mean), times the beams that lie within L of one another;
-- what interpolation misses between cells, and is not shared.
+- what interpolation misses between cells, alike over half a cell only (`shared_between_m2`).
 
 A residual beyond `GATE` sigmas costs what an outlier costs and no more, so a wild beam cannot veto a
 place. Where the map has no data a sounding costs its expected value: a hole neither attracts nor
@@ -17,6 +17,7 @@ repels.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numba
@@ -40,8 +41,9 @@ _MOST_SHARING = 1e4
 class SoundingNoise:
     """Variances (n,) of the soundings of one update.
 
-    `range_m2` and `between_m2` are independent from update to update; `shared_m2` is the map's error
-    as it is, `inflated_m2` the sum of all with the map's error inflated by its sharing.
+    `range_m2` is independent from update to update; `between_m2` is what interpolation misses, its
+    sharing counted; `shared_m2` is the map's error as it is, `inflated_m2` the sum of all with the
+    map's error inflated by its sharing.
     """
 
     range_m2: FloatArray
@@ -72,12 +74,28 @@ def sounding_noise(
         )
         if variance > 0
     )
+    between = shared_between_m2(terrain, step_m)
     return SoundingNoise(
         range_m2=range_m2,
-        between_m2=error.between_m**2,
+        between_m2=between,
         shared_m2=error.filtered_m**2 + error.correlated_m**2,
-        inflated_m2=range_m2 + error.between_m**2 + shared,
+        inflated_m2=range_m2 + between + shared,
     )
+
+
+def shared_between_m2(terrain: TerrainMap, way_m: float) -> float:
+    """Variance of what interpolation misses, for soundings that come every `way_m`.
+
+    It is alike over about half a cell L: an AR(1) sequence of correlation exp(-way / L) tells of its
+    mean what ``coth(way / 2 L)`` times fewer values would.
+
+    Parameters
+    ----------
+    way_m : distance since the update before; a vehicle at rest learns nothing new.
+    """
+    reach = 0.5 * max(terrain.cell_m, terrain.cell_north_m)
+    ratio = max(way_m, 1e-3) / (2 * reach)
+    return terrain.error.between_m**2 * min(1.0 / math.tanh(ratio), _MOST_SHARING)
 
 
 @numba.njit(cache=True)

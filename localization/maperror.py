@@ -24,6 +24,9 @@ from perception.records import BoolArray, FloatArray
 _S44_A_M, _S44_B = 0.5, 0.013
 # Below this many cells a spectrum says nothing; the map is used as it is.
 _LEAST_CELLS = 32 * 32
+# Correlation lengths tried where none is given: from what is barely not white from cell to cell to
+# the width of swaths, over which sound speed and tide err alike.
+_SHORTEST_CELLS, _LONGEST_M, _LENGTHS = 1.6, 150.0, 4
 # Terrain spectra fall as k^-p; two-dimensional fractals of Hurst exponent 0 to 1.5 have p of 2 to 5.
 _SLOPES = np.arange(2.0, 5.01, 0.5)
 
@@ -63,6 +66,22 @@ def assumed_sigma(depth_m: float) -> float:
     0.47
     """
     return float(np.hypot(_S44_A_M, _S44_B * depth_m)) / 1.96
+
+
+def map_error_lengths(error: MapError, cell_m: float) -> dict[float, float]:
+    """Correlation lengths (m) that a map's error may have, and their prior weights.
+
+    One where it was given, or where all of it is white; else several, all alike: a stated sigma says
+    nothing of the length, and each length passes for terrain of another kind.
+    """
+    if np.isfinite(error.length_m):
+        white = error.filtered_m > error.correlated_m
+        return {error.filtered_length_m if white else error.length_m: 1.0}
+    if error.correlated_m == 0:
+        return {error.filtered_length_m: 1.0}
+    shortest = _SHORTEST_CELLS * cell_m
+    tried = np.geomspace(shortest, max(_LONGEST_M, 4 * shortest), _LENGTHS)
+    return {float(length): 1.0 / _LENGTHS for length in tried}
 
 
 def filter_map(

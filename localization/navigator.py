@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from localization.bank import KalmanBank
 from localization.integrity import HealthMonitor, protection_level, with_doubt
-from localization.kalman import KalmanBank
 from localization.measurements import Measurement, Sensors, Soundings, beam_vectors, soundings_of
 from localization.particles import ParticleFilter
 from localization.rival import Evidence
@@ -293,9 +293,13 @@ class Navigator:
             self.search.start(mean, covariance)
             return "uncertainty outgrew the Kalman bank; searching within it"
         place = np.array([m.easting_m, m.northing_m])
-        view = view_of(self.terrain, soundings, place, mean, covariance)
-        gained = self.rival.update(view, self.bank.likeliest())
-        fit = self.bank.update(view)
+        views = {
+            reading: view_of(self.terrain, soundings, place, mean, covariance, reading)
+            for reading in self.bank.readings()
+        }
+        likeliest = self.bank.likeliest()
+        gained = self.rival.update(views[likeliest.reading], likeliest)
+        fit = self.bank.update(views)
         self.since_update_m = 0.0
         if not len(fit.normalised):
             return ""

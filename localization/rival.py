@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from localization.kalman import Hypothesis
+from localization.hypotheses import Hypothesis
 from localization.likelihood import GATE
 from localization.terrain import TerrainMap
 from localization.view import View
@@ -43,6 +43,7 @@ class Evidence:
 
     def __init__(self, terrain: TerrainMap) -> None:
         self.covariance = fitted_covariance(*terrain.structure)
+        self.between_m2 = terrain.error.between_m**2
         self.reset()
 
     def reset(self) -> None:
@@ -67,7 +68,7 @@ class Evidence:
                 view.elevation_m,
                 view.elevation_m - view.height_m,
                 noise,
-                noise + view.unplaced_m2 + view.left_m2 + assumed.white_m2,
+                noise + view.unplaced_m2 + view.left_m2 + self.between_m2,
             ],
             axis=1,
         )

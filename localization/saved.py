@@ -22,6 +22,7 @@ _PLAIN_STATE = (
 
 def state_of(navigator: Navigator) -> tuple[dict[str, FloatArray], dict[str, Any]]:
     """Return all that the next update depends on, as arrays and plain values."""
+    words: dict[str, Any] = {name: getattr(navigator, name) for name in _PLAIN_STATE}
     arrays: dict[str, FloatArray] = {
         f"cloud_{k}": v for k, v in asdict(navigator.search.cloud).items()
     }
@@ -30,12 +31,14 @@ def state_of(navigator: Navigator) -> tuple[dict[str, FloatArray], dict[str, Any
     for i, (mean, covariance) in enumerate([navigator.reckoned, *navigator.trusted]):
         arrays[f"trusted_{i}_mean"], arrays[f"trusted_{i}_covariance"] = mean, covariance
     arrays["bank_weight"], arrays["velocity"] = navigator.bank.log_weight, navigator.velocity
-    arrays["apart"] = navigator.bank.apart_m
+    bank = navigator.bank
+    arrays["places"], arrays["heading"] = bank.places_m, bank.heading_m
+    words["bank"] = [bank.assumed.index(f.assumed) for f in bank.filters]
+    words["bank_way_m"], words["bank_updates"] = bank.way_m, bank.updates
     arrays["rival"], arrays["seen"] = navigator.rival.known, np.array(sorted(navigator.seen_times))
     arrays["health"] = np.array(navigator.health.normalised).reshape(
         -1, len(navigator.sensors.beams)
     )
-    words = {name: getattr(navigator, name) for name in _PLAIN_STATE}
     words["rng"] = navigator.search.rng.bit_generator.state
     words["misses"] = navigator.rival.misses
     words["trusted"] = len(navigator.trusted)
@@ -60,12 +63,16 @@ def bring_to(
         for i in range(words["trusted"] + 1)
     ]
     navigator.reckoned, navigator.trusted = trusted[0], trusted[1:]
-    navigator.bank.apart_m = np.asarray(arrays["apart"]).copy()
-    if len(arrays["bank_weight"]):
-        navigator.bank.start(*navigator.reckoned)
-        for i, f in enumerate(navigator.bank.filters):
+    bank = navigator.bank
+    bank.places_m = np.asarray(arrays["places"]).copy()
+    bank.heading_m = np.asarray(arrays["heading"]).copy()
+    if words["bank"]:
+        bank.start(*navigator.reckoned)
+        bank.keep(words["bank"])
+        for i, f in enumerate(bank.filters):
             f.take(arrays[f"filter_{i}_x"], arrays[f"filter_{i}_p"])
-        navigator.bank.log_weight[:] = arrays["bank_weight"]
+        bank.log_weight = np.asarray(arrays["bank_weight"]).copy()
+    bank.way_m, bank.updates = words["bank_way_m"], words["bank_updates"]
     navigator.velocity = np.asarray(arrays["velocity"])
     navigator.rival.known, navigator.rival.misses = arrays["rival"], words["misses"]
     navigator.seen_times = set(arrays["seen"].tolist())

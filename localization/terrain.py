@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from localization.maperror import MapError, filter_map
+from localization.maperror import MapError, filter_map, map_error_lengths
+from localization.readings import Reading, expected_ground
 from perception.records import FloatArray, Grid, InputError, NoOverlapError
 
 # Three-point Gauss-Hermite rule, the nodes in sigmas: exact for terrain up to a quintic along an axis.
@@ -28,11 +29,13 @@ class TerrainMap:
 
     Attributes
     ----------
-    height_m : (rows, cols) float32 elevation, NaN no data; row 0 is the northernmost.
+    height_m : (rows, cols) float32 elevation, NaN no data; row 0 is the northernmost. It is the
+        reading that a search uses, `readings[middle].height_m`.
     sigma_m : (rows, cols) float32 1-sigma of `height_m`.
     west_m, north_m : *centre* of the first cell (not its edge: one subtraction less per lookup).
     cell_m, cell_north_m : size of a cell.
     error : what is known of the map's error.
+    readings : the ground as it is expected under each correlation length of the map's error.
     structure : lags (m) and mean square difference of height (m^2) over them.
     """
 
@@ -44,6 +47,12 @@ class TerrainMap:
     cell_north_m: float
     error: MapError
     structure: tuple[FloatArray, FloatArray]
+    readings: tuple[Reading, ...]
+
+    @property
+    def middle(self) -> int:
+        """Index of the reading that a search uses: the second shortest, whose filter is heaviest."""
+        return min(1, len(self.readings) - 1)
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
@@ -113,8 +122,9 @@ def terrain_map(
     height, sigma, error = filter_map(
         part.elevation_m, part.sigma_m, part.cell_m, part.cell_north_m, error_length_m
     )
+    readings = _readings(height, part.sigma_m, (part.cell_m, part.cell_north_m), error)
     return TerrainMap(
-        height_m=np.ascontiguousarray(height, np.float32),
+        height_m=readings[min(1, len(readings) - 1)].height_m,
         sigma_m=np.ascontiguousarray(sigma, np.float32),
         west_m=part.west_m + part.cell_m / 2,
         north_m=part.north_m - part.cell_north_m / 2,
@@ -122,7 +132,23 @@ def terrain_map(
         cell_north_m=part.cell_north_m,
         error=error,
         structure=_structure(height, part.cell_m),
+        readings=readings,
     )
+
+
+def _readings(
+    height_m: FloatArray, sigma_m: FloatArray, cell_m: tuple[float, float], error: MapError
+) -> tuple[Reading, ...]:
+    """Read the map under every correlation length that its error may have, shortest first."""
+    lengths = map_error_lengths(error, max(cell_m))
+    shared = float(np.hypot(error.filtered_m, error.correlated_m))
+    if error.correlated_m == 0:
+        # White or no error at all: filtered already.
+        height = np.ascontiguousarray(height_m, np.float32)
+        return tuple(Reading(length, w, shared, height) for length, w in lengths.items())
+    excess = sigma_m / max(error.stated_m, 1e-9)
+    found = expected_ground(height_m, excess, cell_m, shared, lengths)
+    return tuple(sorted(found, key=lambda reading: reading.length_m))
 
 
 def _structure(height_m: FloatArray, cell_m: float) -> tuple[FloatArray, FloatArray]:

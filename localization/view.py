@@ -48,11 +48,13 @@ def view_of(
     place_m: FloatArray,
     mean: FloatArray,
     covariance: FloatArray,
+    reading: int = 0,
 ) -> View:
     """Linearise the terrain under the soundings of one update.
 
     Parameters
     ----------
+    reading : index of the map's reading.
     place_m : (2,) dead-reckoned position.
     mean, covariance : (5,) and (5, 5), the state before the update.
     """
@@ -64,7 +66,7 @@ def view_of(
     out_north = s.north_m - mean[TURN] * s.east_m
     east = place_m[0] + mean[EAST] + out_east
     north = place_m[1] + mean[NORTH] + out_north
-    plane = linearise(terrain.height_m, terrain.frame, east, north, root)
+    plane = linearise(terrain.readings[reading].height_m, terrain.frame, east, north, root)
     on = np.isfinite(plane[:, 0])
     height, slope_e, slope_n, left = plane[on].T
     jacobian = np.zeros((len(height), 5))
