@@ -19,6 +19,8 @@ from perception.records import FloatArray
 
 # Risk that the error exceeds the protection level, for each update.
 RISK = 1e-5
+# Part of starts whose stated sigma is wrong, and by what factor.
+_TAIL, _TAIL_WIDTH = 0.1, 3.0
 # Updates in the short and the long window.
 _SHORT, _LONG = 12, 60
 # With one beam in ten wild, 35 % outside the gate in 48 soundings has a chance below 1e-6.
@@ -104,6 +106,19 @@ def protection_level(covariance: FloatArray, risk: float = RISK) -> float:
     """
     largest = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     return math.sqrt(max(largest, 0.0)) * math.sqrt(-2.0 * math.log(risk))
+
+
+def unproved_protection(covariance: FloatArray, away_m: float, risk: float = RISK) -> float:
+    """Radius around a place not yet proved that the error exceeds with the stated risk at most.
+
+    Before proof all rests on what was *stated* of the start, and a statement has heavier tails than
+    a normal density: one in ten is taken to be three times as wide, as the search takes it. Of the
+    wide part ``0.1 exp(-r^2 / (2 (3 sigma)^2)) = risk``; the place told lies `away_m` from its centre.
+
+    >>> round(unproved_protection(np.eye(2), 0.0), 2)
+    12.88
+    """
+    return _TAIL_WIDTH * protection_level(covariance, risk / _TAIL) + away_m
 
 
 def with_doubt(

@@ -17,9 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.bank import KalmanBank
-from localization.integrity import HealthMonitor, protection_level, with_doubt
+from localization.integrity import (
+    HealthMonitor,
+    protection_level,
+    unproved_protection,
+    with_doubt,
+)
 from localization.measurements import Measurement, Sensors, Soundings, beam_vectors, soundings_of
 from localization.particles import ParticleFilter
+from localization.proof import Proof, doubt_of
+from localization.reckoning import Reckoning
 from localization.rival import Evidence
 from localization.terrain import TerrainMap
 from localization.view import view_of
@@ -27,27 +34,14 @@ from perception.records import FloatArray
 
 logger = logging.getLogger(__name__)
 
-# Mean (5,) and covariance (5, 5) of east, north, heading bias, scale, depth bias.
-Gaussian = tuple[FloatArray, FloatArray]
-
 CONVERGED, SEARCHING, RECKONING, LOST = "converged", "searching", "dead-reckoning", "lost"
 
-# Probability, before the match is tested, that the place found is a wrong one.
-_DOUBT = 0.05
-# Evidence is not hoarded above this, so that later failure shows soon; below minus `_REFUTED` the
-# map does worse than no map. Where ground or map tell little, the evidence is a random walk about
-# zero: an allowance for each update keeps that walk from reaching the bar.
-_MOST_EVIDENCE, _LEAST_EVIDENCE, _REFUTED, _ALLOWANCE = 30.0, -6.0, 15.0, 0.1
 # Seconds without a sounding after which the status is dead reckoning.
 _SILENT_S = 15.0
 # A step longer than this, and faster than both speeds below, is a reset of dead reckoning.
 _LEAST_JUMP_M, _SLOW_M_S, _FASTER = 10.0, 5.0, 5.0
-# Evidence at which a proved match is believed although its innovations repeat.
-_VOUCHED = 10.0
 # Mean square of recent innovations, 1 if the match claims right, above which a proved one may fail.
 _STRAINED = 1.6
-# What may have gone wrong unseen since the last trusted state, an axis.
-_LOST_M = 10.0
 # Speed error assumed while the navigation itself gives no position.
 _BLIND_M_S = 0.5
 
@@ -125,31 +119,21 @@ class Navigator:
         self.vectors = beam_vectors(sensors.beams) if sensors.beams else np.zeros((0, 3))
         self.fractions = np.array([b.fraction or sensors.beam_fraction for b in sensors.beams])
         walk = sensors.walk_m_sqrt_h
-        self.walk_m2_s = (self.config.walk_m_sqrt_h if walk is None else walk) ** 2 / 3600.0
+        assumed = self.config.walk_m_sqrt_h if walk is None else walk
+        self.reckoning = Reckoning(sensors, assumed**2 / 3600.0)
         self.search = ParticleFilter(terrain, self.config.particles, rng)
         self.bank = KalmanBank(terrain, walk, sensors.tide_m_sqrt_h, len(sensors.beams))
         self.health = HealthMonitor()
         self.tracking = False
         self.rival = Evidence(terrain)
-        self.proved = 0
-        self.evidence, self.against = 0.0, 0.0
+        self.proof = Proof(self.config.probation, self.config.proof)
         self.losses = 0
-        self.attempts = 0
-        self.converged_once = False
         self.last: Measurement | None = None
         self.velocity: FloatArray = np.zeros(2)
         self.since_update_m = 0.0
         self.heard_s = -math.inf
         self.seen_times: set[float] = set()
-        # Dead reckoning from the last trusted state: mean (5,), covariance (5, 5).
-        self.reckoned: Gaussian = (np.zeros(5), self._start_covariance())
-        self.trusted: list[Gaussian] = []
-        self.search.start(*self.reckoned)
-
-    def _start_covariance(self) -> FloatArray:
-        s = self.sensors
-        sigma = np.array([s.start_m, s.start_m, s.heading_rad, s.scale, s.depth_bias_m])
-        return np.diag(np.maximum(sigma, 1e-6) ** 2)
+        self.search.start(*self.reckoning.state)
 
     # ---- one row -------------------------------------------------------------------------------
 
@@ -185,7 +169,7 @@ class Navigator:
 
     def wander_m2_s(self) -> tuple[float, float]:
         """Random walk, variance per second, found of the position (an axis) and of the depth bias."""
-        walk = self.bank.walk_m2_s() if self.tracking else self.walk_m2_s
+        walk = self.bank.walk_m2_s() if self.tracking else self.reckoning.walk_m2_s
         return walk, self.sensors.tide_m_sqrt_h**2 / 3600.0
 
     def _remember(self, time_s: float) -> None:
@@ -215,37 +199,19 @@ class Navigator:
         else:
             self.velocity = step / seconds
         self.since_update_m += float(np.hypot(*step))
-        walk_m2 = self.walk_m2_s * seconds + slip_m2
-        self.reckoned = self._reckon(self.reckoned, step, seconds, walk_m2)
-        self.trusted = [self._reckon(state, step, seconds, walk_m2) for state in self.trusted]
+        self.reckoning.advance(step, seconds, slip_m2)
         if self.tracking:
             self.bank.predict(step[0], step[1], seconds, slip_m2)
         else:
+            walk_m2 = self.reckoning.walk_m2_s * seconds + slip_m2
             self.search.predict(step[0], step[1], walk_m2)
         return reason
 
     def _shift(self, jump: FloatArray) -> None:
         """Move every offset by what the dead-reckoned position jumped against."""
-        move = np.array([jump[0], jump[1], 0.0, 0.0, 0.0])
-        self.reckoned = self.reckoned[0] + move, self.reckoned[1]
-        self.trusted = [(mean + move, covariance) for mean, covariance in self.trusted]
+        self.reckoning.shift(jump)
         self.search.shift(jump)
         self.bank.shift(jump)
-
-    def _reckon(
-        self,
-        state: Gaussian,
-        step: FloatArray,
-        seconds: float,
-        walk_m2: float,
-    ) -> Gaussian:
-        mean, covariance = state
-        f = np.eye(5)
-        f[0, 3], f[0, 2], f[1, 3], f[1, 2] = step[0], step[1], step[1], -step[0]
-        q = np.zeros((5, 5))
-        q[0, 0] = q[1, 1] = walk_m2
-        q[4, 4] = self.sensors.tide_m_sqrt_h**2 * seconds / 3600.0
-        return f @ mean, f @ covariance @ f.T + q
 
     # ---- matching ------------------------------------------------------------------------------
 
@@ -270,14 +236,14 @@ class Navigator:
             return ""
         self.bank.start(mean, covariance)
         self.health.reset()
-        self.tracking, self.proved = True, 0
-        self.evidence, self.against = -self._surprise(mean, covariance), 0.0
+        self.tracking = True
+        self.proof.begin(self._surprise(mean, covariance))
         self.rival.reset()
         return "place found; on probation"
 
     def _surprise(self, mean: FloatArray, covariance: FloatArray) -> float:
         """Evidence against a place far from where dead reckoning has it, beyond three sigmas."""
-        expected, spread = self.reckoned
+        expected, spread = self.reckoning.state
         spread = spread + covariance
         use = [0, 1, 2, 3]
         apart = (mean - expected)[use]
@@ -309,104 +275,89 @@ class Navigator:
             return f"depth stepped by {fit.common_step_m:+.1f} m; depth bias set free"
         self.health.add(fit, len(self.sensors.beams))
         verdict = self.health.verdict()
-        # Coloured innovations of a map that explains the soundings far better than memory does are
-        # the map's own unmodelled error, not a wrong place.
-        vouched = self.converged_once and self.evidence > _VOUCHED
-        if not verdict.healthy and (verdict.grave or not vouched):
+        if not verdict.healthy and (verdict.grave or not self.proof.vouched):
             return self._lose(verdict.reason)
-        self.evidence = min(max(self.evidence + gained, _LEAST_EVIDENCE), _MOST_EVIDENCE)
-        self.against = min(self.against + gained + _ALLOWANCE, 0.0)
+        self.proof.add(gained)
         # A proved match is not given up for free ground's sake alone: where the map is coarse beside
         # the soundings' spacing, memory predicts better than the best map, and nothing is wrong.
-        strained = not self.converged_once or self.health.size() > _STRAINED
-        if self.against < -_REFUTED and strained:
+        strained = not self.proof.believed or self.health.size() > _STRAINED
+        if self.proof.refuted and strained:
             return self._lose("free ground explains the soundings better than the map")
-        self.proved += 1
-        if self._is_proved() and _largest(covariance) < self.config.converged_m:
+        self.proof.updates += 1
+        if self.proof.holds and _largest(covariance) < self.config.converged_m:
             return self._trust()
         return ""
 
-    def _is_proved(self) -> bool:
-        if self.converged_once:
-            return self.evidence > 0.0
-        # Every search that failed is a chance more to be fooled by: the next must prove more.
-        tried = self.attempts
-        return self.proved >= self.config.probation * 2 ** min(
-            tried, 4
-        ) and self.evidence > self.config.proof + 4.0 * min(tried, 5)
-
     def _trust(self) -> str:
-        """Keep the state as one to return to; older ones are surer not to be spoilt already."""
-        state = self.bank.moments()
-        if self.proved % 20 == 0:
-            self.trusted = [*self.trusted, state][-4:]
-        self.reckoned = state if self.proved > 60 else self.reckoned
-        if not self.converged_once:
-            self.losses, self.converged_once = 0, True
-            self.attempts = max(self.attempts - 1, 0)
-            return "converged"
-        return ""
+        self.reckoning.trust(self.bank.moments(), self.proof.updates)
+        if self.proof.believed:
+            return ""
+        self.losses = 0
+        self.proof.convince()
+        return "converged"
 
     def _lose(self, reason: str) -> str:
         """Begin again from the last trusted state with a wider box and a free depth bias."""
         self.losses += 1
-        self.attempts += 1
-        if self.trusted:
-            self.reckoned = self.trusted[0]
-            self.trusted = []
-        mean, box = self.reckoned[0], self._box()
+        self.proof.fail()
+        self.reckoning.fall_back()
+        mean, box = self.reckoning.state[0], self._box()
         box[4, :], box[:, 4] = 0.0, 0.0
         box[4, 4] = self.config.reset_depth_m**2
-        self.tracking, self.proved, self.converged_once = False, 0, False
+        self.tracking = False
         self.health.reset()
         self.search.start(mean, box)
         logger.info("lost: %s", reason)
-        return f"lost: {reason}; searching again within {math.sqrt(_largest2(box)):.0f} m"
+        return f"lost: {reason}; searching again within {_largest(box):.0f} m"
 
     def _box(self) -> FloatArray:
-        """Covariance to search in, and to tell, after a loss: it grows with every one."""
-        growth = self.config.grow ** (2 * min(self.losses - 1, 4))
-        box = self.reckoned[1].copy()
-        box[:2, :2] = growth * (box[:2, :2] + _LOST_M**2 * np.eye(2))
-        return box
+        return self.reckoning.box(self.losses, self.config.grow)
 
     # ---- what is told --------------------------------------------------------------------------
 
     def _estimate(self, m: Measurement, reason: str = "") -> Estimate:
         state, joint, status = self._belief(m)
         easting, northing, blind = self._position(m)
-        covariance = joint[:2, :2] + blind**2 * np.eye(2)
+        blur = blind**2 * np.eye(2)
+        covariance = joint[:2, :2] + blur
+        protection = protection_level(covariance)
+        if not self.proof.believed:
+            mean, reckoned = self.reckoning.state
+            away = float(np.hypot(*(mean - state)[:2]))
+            if self.losses:
+                reckoned = self._box()
+            protection = max(protection, unproved_protection(reckoned[:2, :2] + blur, away))
         return Estimate(
             time_s=m.time_s,
             easting_m=easting + float(state[0]),
             northing_m=northing + float(state[1]),
             covariance_m2=covariance,
             status=status,
-            protection_m=protection_level(covariance),
+            protection_m=protection,
             state=state,
             state_covariance=joint,
             reason=reason,
         )
 
     def _belief(self, m: Measurement) -> tuple[FloatArray, FloatArray, str]:
+        """Mean (5,) and covariance (5, 5) to tell, and the status."""
         silent = m.time_s - self.heard_s > _SILENT_S
         if self.losses:
-            return self.reckoned[0], self._box(), RECKONING if silent else LOST
-        if self.tracking:
-            mean, covariance = self.bank.moments()
-            proved = self._is_proved()
-            if not self.converged_once:
-                doubt = _doubt(self.evidence)
-                mean, covariance = with_doubt(mean, covariance, *self.reckoned, doubt)
-            if silent:
-                return mean, covariance, RECKONING
-            sure = proved and _largest(covariance) < self.config.converged_m
-            return mean, covariance, CONVERGED if sure else SEARCHING
-        mean, covariance = self.search.moments()
-        if not self.converged_once:
-            doubt = _doubt(-self._surprise(mean, covariance))
-            mean, covariance = with_doubt(mean, covariance, *self.reckoned, doubt)
-        return mean, covariance, RECKONING if silent else SEARCHING
+            return self.reckoning.state[0], self._box(), RECKONING if silent else LOST
+        status = RECKONING if silent else SEARCHING
+        if not self.tracking:
+            mean, covariance = self.search.moments()
+            if not self.proof.believed:
+                doubt = doubt_of(-self._surprise(mean, covariance))
+                mean, covariance = with_doubt(mean, covariance, *self.reckoning.state, doubt)
+            return mean, covariance, status
+        mean, covariance = self.bank.moments()
+        if not self.proof.believed:
+            doubt = self.proof.doubt
+            mean, covariance = with_doubt(mean, covariance, *self.reckoning.state, doubt)
+        if not silent and self.proof.holds and _largest(covariance) < self.config.converged_m:
+            status = CONVERGED
+        return mean, covariance, status
 
     def _position(self, m: Measurement) -> tuple[float, float, float]:
         """Dead-reckoned position of a row, and what is not known of it when the row has none."""
@@ -419,19 +370,6 @@ class Navigator:
         return self.last.easting_m + ahead[0], self.last.northing_m + ahead[1], _BLIND_M_S * gap
 
 
-def _doubt(evidence: float) -> float:
-    """Probability that a place not yet proved is the wrong one; evidence against it raises that.
-
-    Evidence for it counts once the match is proved, not before: a lucky ping is no proof.
-    """
-    against = math.exp(min(max(evidence, -30.0), 0.0))
-    return _DOUBT / (_DOUBT + (1 - _DOUBT) * against)
-
-
-def _largest2(covariance: FloatArray) -> float:
-    return float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-
-
 def _largest(covariance: FloatArray) -> float:
     """Largest 1-sigma of the horizontal position."""
-    return math.sqrt(max(_largest2(covariance), 0.0))
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0))

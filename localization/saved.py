@@ -11,13 +11,11 @@ import numpy as np
 from localization.measurements import Measurement
 from localization.navigator import Navigator
 from localization.particles import Cloud
+from localization.proof import Proof
 from perception.records import FloatArray
 
 # Attributes of a navigator that are plain values: with its arrays, all its memory.
-_PLAIN_STATE = (
-    "tracking", "proved", "evidence", "against", "losses", "attempts", "converged_once",
-    "since_update_m", "heard_s",
-)  # fmt: skip
+_PLAIN_STATE = ("tracking", "losses", "since_update_m", "heard_s")
 
 
 def state_of(navigator: Navigator) -> tuple[dict[str, FloatArray], dict[str, Any]]:
@@ -28,7 +26,9 @@ def state_of(navigator: Navigator) -> tuple[dict[str, FloatArray], dict[str, Any
     }
     for i, f in enumerate(navigator.bank.filters):
         arrays[f"filter_{i}_x"], arrays[f"filter_{i}_p"] = f.filter.x, f.filter.P
-    for i, (mean, covariance) in enumerate([navigator.reckoned, *navigator.trusted]):
+    for i, (mean, covariance) in enumerate(
+        [navigator.reckoning.state, *navigator.reckoning.trusted]
+    ):
         arrays[f"trusted_{i}_mean"], arrays[f"trusted_{i}_covariance"] = mean, covariance
     arrays["bank_weight"], arrays["velocity"] = navigator.bank.log_weight, navigator.velocity
     bank = navigator.bank
@@ -41,7 +41,8 @@ def state_of(navigator: Navigator) -> tuple[dict[str, FloatArray], dict[str, Any
     )
     words["rng"] = navigator.search.rng.bit_generator.state
     words["misses"] = navigator.rival.misses
-    words["trusted"] = len(navigator.trusted)
+    words["trusted"] = len(navigator.reckoning.trusted)
+    words["proof"] = asdict(navigator.proof)
     if navigator.last is not None:
         last = {k: v for k, v in asdict(navigator.last).items() if k != "slant_range_m"}
         words["last"], arrays["last_ranges"] = last, navigator.last.slant_range_m
@@ -62,12 +63,13 @@ def bring_to(
         (arrays[f"trusted_{i}_mean"], arrays[f"trusted_{i}_covariance"])
         for i in range(words["trusted"] + 1)
     ]
-    navigator.reckoned, navigator.trusted = trusted[0], trusted[1:]
+    navigator.reckoning.state, navigator.reckoning.trusted = trusted[0], trusted[1:]
+    navigator.proof = Proof(**words["proof"])
     bank = navigator.bank
     bank.places_m = np.asarray(arrays["places"]).copy()
     bank.heading_m = np.asarray(arrays["heading"]).copy()
     if words["bank"]:
-        bank.start(*navigator.reckoned)
+        bank.start(*navigator.reckoning.state)
         bank.keep(words["bank"])
         for i, f in enumerate(bank.filters):
             f.take(arrays[f"filter_{i}_x"], arrays[f"filter_{i}_p"])
