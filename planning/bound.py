@@ -17,7 +17,7 @@ from numba import njit
 from scipy import ndimage
 
 from perception.records import FloatArray
-from planning.surface import WEIGHT, Surface
+from planning.surface import DRIFT_X, WEIGHT, Surface
 
 _NODES = 40_000
 _REPAIRS = 8
@@ -26,6 +26,14 @@ _REPAIRS = 8
 def lower_bound(surface: Surface, start: tuple[float, float], goal: tuple[float, float]) -> float:
     """Return a cost that no route from start to goal (easting, northing) can undercut."""
     ends = [surface.local(np.array(p[0]), np.array(p[1])) for p in (start, goal)]
+    # No current carries faster than its strongest along the path.
+    carried = 1.0
+    if surface.drifts:
+        carried = 1.0 / (1.0 + float(np.hypot(*surface.stack[..., DRIFT_X:].T).max()))
+    return carried * _still_water_bound(surface, ends)
+
+
+def _still_water_bound(surface: Surface, ends: list[tuple[FloatArray, FloatArray]]) -> float:
     straight = float(np.hypot(*(np.array(ends[1]) - np.array(ends[0]))))
     weights = surface.stack[..., WEIGHT]
     simple = straight * float(weights.min())

@@ -17,7 +17,14 @@ from numba import njit
 
 from perception.records import FloatArray
 from planning.polish import respace, rules_of
-from planning.profile import BAR_PRICE, EXCESS_PRICE, cone_envelope, make_work, sample_stack
+from planning.profile import (
+    BAR_PRICE,
+    EXCESS_PRICE,
+    cone_envelope,
+    make_work,
+    sample_stack,
+    water_per_ground,
+)
 from planning.surface import Surface
 
 # Extent of the third coordinate: u in [0, U_EXTENT_M], so that its scale is like that of the offsets.
@@ -175,8 +182,10 @@ def _motion_cost(  # type: ignore[no-untyped-def]
     if n > len(work):
         return np.inf
     s, lower, upper, z, density = work[:, 0], work[:, 1], work[:, 2], work[:, 3], work[:, 4]
+    water = work[:, 5]
     px = py = 0.0
     bar_total = 0.0
+    drifts = stack.shape[2] > 4
     for i in range(n):
         v = i / (n - 1)
         x, y = _place(line, normal, spacing, s0 + v * (s1 - s0), o0 + v * (o1 - o0))
@@ -185,6 +194,7 @@ def _motion_cost(  # type: ignore[no-untyped-def]
         upper[i] = min(bottom + rules[4], rules[6]) - rules[7]
         density[i] = w - a * (bottom + rules[3])
         leg = math.hypot(x - px, y - py) if i > 0 else 0.0
+        water[i] = water_per_ground(stack, width, height, px, py, x, y) if drifts and i > 0 else 1.0
         s[i] = s[i - 1] + leg if i > 0 else 0.0
         bar_total += bar * leg
         px, py = x, y
@@ -196,7 +206,7 @@ def _motion_cost(  # type: ignore[no-untyped-def]
     jump = max(0.0, z[0] - pin0 - _PIN_M) + max(0.0, z[n - 1] - pin1 - _PIN_M)
     for i in range(1, n):
         ds, dz = s[i] - s[i - 1], z[i] - z[i - 1]
-        rate = 0.5 * (density[i] + density[i - 1] + a * (z[i] + z[i - 1]))
+        rate = 0.5 * (density[i] + density[i - 1] + a * (z[i] + z[i - 1])) * water[i]
         cost += rate * math.sqrt(ds * ds + dz * dz)
         excess += max(0.0, z[i] - upper[i]) * ds
     return cost + EXCESS_PRICE * (excess + jump) + BAR_PRICE * bar_total

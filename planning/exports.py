@@ -13,6 +13,7 @@ from xml.sax.saxutils import quoteattr
 from pyproj import CRS, Transformer
 
 from perception.files import write_text
+from perception.geodesy import is_local
 from perception.records import FloatArray
 from planning.route import Route
 
@@ -30,8 +31,8 @@ def lonlat(route: Route) -> tuple[FloatArray, FloatArray]:
 
 
 def write_exports(out: Path, route: Route, speed_m_s: float) -> bool:
-    """Write route.gpx and route.plan; return False (and write nothing) without a CRS."""
-    if not route.crs:
+    """Write route.gpx and route.plan; return False (and write nothing) without a place on Earth."""
+    if is_local(route.crs):
         return False
     write_text(out / "route.gpx", gpx(route))
     write_text(out / "route.plan", qgc_plan(route, speed_m_s))

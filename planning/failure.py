@@ -12,11 +12,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from perception.records import BoolArray, FloatArray, IntArray
+from planning.currents import STRONGEST
 from planning.curve import waypoints
 from planning.field import search
 from planning.polish import RADIUS_RESERVE, Candidate, evaluate, polish, respace, rules_of
 from planning.profile import cone_envelope, make_work, path_cost
-from planning.surface import BAR, BOTTOM, LOWER, WEIGHT, Surface
+from planning.surface import BAR, BOTTOM, DRIFT_X, LOWER, WEIGHT, Surface
 
 # Price of a metre through barred ground: a detour of a hundred times a wall's thickness is taken first.
 _WALL_PRICE = 100.0
@@ -114,6 +115,8 @@ def _what_bars(surface: Surface, row: int, col: int) -> str:
             f"where floor and k sigma need {lower - bottom:.1f} m of altitude: a ceiling_m of "
             f"{lower - bottom:.1f} or a higher --risk opens it"
         )
+    if surface.drifts and np.hypot(*surface.stack[row, col, DRIFT_X:]) > STRONGEST:
+        return "where the current is as strong as the vehicle: a higher speed_m_s opens it"
     return "in a no-go area: leave it out or move an end"
 
 

@@ -16,7 +16,7 @@ from perception.records import FloatArray, bilinear
 from planning.curve import waypoints
 from planning.ground import Ground, SurfaceGround
 from planning.polish import PITCH_RESERVE, RADIUS_RESERVE
-from planning.profile import bridge_troughs, cone_envelope
+from planning.profile import bridge_troughs, cone_envelope, water_per_ground
 from planning.surface import WEIGHT, Surface
 
 POSITION_DIGITS = 5
@@ -246,4 +246,24 @@ def exact_cost(surface: Surface, w: Waypoints, parts: int = 8) -> float:
     above = between(z) - bilinear(surface.bottom_m, row, col) - surface.limits.floor_m
     rate = bilinear(surface.stack[..., WEIGHT], row, col)
     rate = rate + surface.terms.altitude_per_m * np.maximum(0.0, above)
-    return float((rate.mean(axis=1) * lengths).sum())
+    return float((rate.mean(axis=1) * lengths * water_along(surface, w)).sum())
+
+
+def travel_time_s(surface: Surface, w: Waypoints) -> float:
+    """Return how long the vehicle takes at its speed through the water, currents included."""
+    legs = np.diff(w.distance_m) * water_along(surface, w)
+    return float(legs.sum() / surface.limits.speed_m_s)
+
+
+def water_along(surface: Surface, w: Waypoints) -> FloatArray:
+    """Return (n - 1,) metres of water per metre of each segment."""
+    x, y = surface.local(w.easting_m, w.northing_m)
+    if not surface.drifts:
+        return np.ones(len(x) - 1)
+    width, height = surface.cell_m
+    return np.array(
+        [
+            water_per_ground(surface.stack, width, height, x[i], y[i], x[i + 1], y[i + 1])
+            for i in range(len(x) - 1)
+        ]
+    )

@@ -33,18 +33,19 @@ class Ground(Protocol):
 
 
 class SurfaceGround:
-    """The ground of a surface held whole."""
+    """The ground of a surface held whole, or of a window: of it only the two heights are kept."""
 
-    def __init__(self, surface: Surface) -> None:
-        self.surface = surface
+    def __init__(self, surface: Surface, weighted: bool = True) -> None:
+        self._origin_m, self._cell_m = surface.origin_m, surface.cell_m
         self._least = np.where(surface.barred, np.nan, surface.lower_m)
         self._bottom = np.where(surface.barred, np.nan, surface.bottom_m)
+        self._weight = surface.stack[..., WEIGHT] if weighted else None
 
     def _index(
         self, easting_m: FloatArray, northing_m: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        x, y = self.surface.local(easting_m, northing_m)
-        return y / self.surface.cell_m[1], x / self.surface.cell_m[0]
+        row = (self._origin_m[1] - np.asarray(northing_m, float)) / self._cell_m[1]
+        return row, (np.asarray(easting_m, float) - self._origin_m[0]) / self._cell_m[0]
 
     def at(
         self, easting_m: FloatArray, northing_m: FloatArray
@@ -54,7 +55,7 @@ class SurfaceGround:
         return (
             bilinear(self._least, row, col),
             bilinear(self._bottom, row, col),
-            bilinear(self.surface.stack[..., WEIGHT], row, col),
+            np.ones(row.shape) if self._weight is None else bilinear(self._weight, row, col),
         )
 
     def extremes(
@@ -70,19 +71,26 @@ class SurfaceGround:
 
 @dataclass(frozen=True, slots=True)
 class WindowedGround:
-    """The ground of consecutive stretches of one route; neighbours share a waypoint."""
+    """The ground of consecutive stretches of one route; neighbours share a waypoint.
+
+    Attributes
+    ----------
+    weights : the ground whose weights count: windows have none of their own.
+    """
 
     stretches: list[slice]
     parts: list[SurfaceGround]
+    weights: SurfaceGround
 
     def at(
         self, easting_m: FloatArray, northing_m: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return least height, bottom and weight at each waypoint; NaN where barred."""
-        out = np.empty((3, len(easting_m)))
+        least, bottom = (np.empty(len(easting_m)) for _ in range(2))
         for part, where in zip(self.parts, self.stretches, strict=True):
-            out[:, where] = part.at(easting_m[where], northing_m[where])
-        return out[0], out[1], out[2]
+            least[where], bottom[where], _ = part.at(easting_m[where], northing_m[where])
+        weight = self.weights.at(easting_m, northing_m)[2]
+        return least, bottom, np.where(np.isfinite(weight), weight, 1.0)
 
     def extremes(
         self, easting_m: FloatArray, northing_m: FloatArray, z: FloatArray

@@ -1,36 +1,40 @@
-"""Maps too large to hold: plan at reduced resolution, prove at full resolution.
+"""Maps too large to hold: block means to plan on, windows to prove in.
 
-The route is found on a map of block means; its clearance is then proved, and its depths are made, over
-the raster as stored, read in windows along the route. What that gives up is said in docs/planning.md: a
-detour between two obstacles narrower than a block is not found.
+What that gives up is said in docs/planning.md: a gap narrower than a block is found only where the
+repair of a stretch (`planning.full_resolution`) comes by it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rasterio
-from rasterio.windows import Window
 
+from mapping.rasters import OpenMap, open_map
 from perception.files import existing_file
-from perception.records import FloatArray, Grid, InputError
-from planning.finish import prove
-from planning.ground import SurfaceGround, WindowedGround
-from planning.planner import Plan
-from planning.risk import clearance_sigma
-from planning.route import route_of
-from planning.surface import Surface, build_surface
+from perception.records import (
+    REGION_CLASSES,
+    FloatArray,
+    Grid,
+    InputError,
+    NoOverlapError,
+    Progress,
+    silent,
+)
 
-# Cells that planning holds at once: 40 bytes each in the surfaces and searches.
+# Cells that planning holds at once: 70 bytes each in the surfaces and searches.
 MOST_CELLS = 30_000_000
 # Cells of the reduced map, for a search of seconds.
 REDUCED_CELLS = 2_500_000
-# Side of the windows, in cells, that a proof along a route reads.
-_WINDOW_CELLS = 1000.0
+# Share of a block that must hold heights for it to count in the second try.
+_LOOSE_SHARE = 0.5
+# Cells read at once, and cells read in a second from a compressed file on one core: for the estimate.
+_BAND_CELLS, _CELLS_PER_S = 8_000_000, 12e6
 
 
 def raster_cells(path: Path) -> int:
@@ -42,148 +46,166 @@ def raster_cells(path: Path) -> int:
         return 0
 
 
-def read_reduced(path: Path) -> tuple[Grid, int]:
-    """Read a large map as block means, row band by row band.
+def map_crs(path: Path) -> str:
+    """Return a map's CRS without reading it; refusals of `read_map`."""
+    with open_map(path) as opened:
+        return opened.source.crs.to_string() if opened.source.crs else ""
 
-    Returns
-    -------
-    The reduced grid (a block with a cell of no data is no data: NaN is impassable) and the number of cells per block side.
+
+def reading_seconds(cells: int) -> float:
+    """Return about how long one reading of so many cells takes."""
+    return cells / _CELLS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Reduced:
+    """A large map as blocks.
+
+    Attributes
+    ----------
+    grid : means of the blocks' heights, worst sigma; a block with any cell of no data is no data.
+    loose_m : (rows, cols) heights where a block may lack up to half of its cells.
+    block : cells along a block's side.
+    cell_m : width and height of a cell as stored.
+    """
+
+    grid: Grid
+    loose_m: FloatArray
+    block: int
+    cell_m: tuple[float, float]
+
+    @property
+    def loose(self) -> Grid:
+        """The map with half-filled blocks counted in."""
+        return replace(self.grid, elevation_m=self.loose_m)
+
+
+def read_reduced(path: Path, sigma_m: float | None = None, progress: Progress = silent) -> Reduced:
+    """Read a large map as blocks, row band by row band; arguments and refusals of `read_map`."""
+    with open_map(path, sigma_m) as opened:
+        height, width = opened.shape
+        block = max(1, math.ceil(math.sqrt(height * width / REDUCED_CELLS)))
+        rows, cols = height // block, width // block
+        mean, loose, sigma = (np.full((rows, cols), np.nan) for _ in range(3))
+        step = max(1, _BAND_CELLS // (width * block))
+        for first in range(0, rows, step):
+            last = min(rows, first + step)
+            part = opened.read(slice(first * block, last * block), slice(0, cols * block))
+            mean[first:last], loose[first:last] = _means(part.elevation_m, block)
+            if part.sigma_m is not None:
+                # The worst of a block stands for it; one without a sigma leaves it without.
+                sigma[first:last] = _blocks(part.sigma_m, block).max(axis=(1, 3))
+            progress("reading the map", last, rows)
+        corner = opened.read(slice(0, 1), slice(0, 1))
+    if not np.isfinite(loose).any():
+        raise InputError(f"{path}: holds no block of {block} x {block} cells with heights")
+    grid = replace(
+        corner,
+        elevation_m=mean,
+        sigma_m=sigma if np.isfinite(sigma).any() else None,
+        count=None,
+        cell_m=block * corner.cell_m,
+        cell_height_m=block * corner.cell_north_m,
+    )
+    return Reduced(grid, loose, block, (corner.cell_m, corner.cell_north_m))
+
+
+def _blocks(values: FloatArray, block: int) -> FloatArray:
+    rows, cols = values.shape
+    return values.reshape(rows // block, block, cols // block, block)
+
+
+def _means(values: FloatArray, block: int) -> tuple[FloatArray, FloatArray]:
+    """Return the blocks' means, NaN where any cell is, and NaN where half of the cells are."""
+    known = np.isfinite(values)
+    share = _blocks(known, block).mean(axis=(1, 3))
+    total = _blocks(np.where(known, values, 0.0), block).mean(axis=(1, 3))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = total / share
+    return np.where(share == 1.0, mean, np.nan), np.where(share >= _LOOSE_SHARE, mean, np.nan)
+
+
+def read_window(
+    path: Path,
+    box: tuple[float, float, float, float],
+    margin_m: float = 0.0,
+    sigma_m: float | None = None,
+) -> Grid:
+    """Read, at full resolution, the cells in and around a box (west, south, east, north)."""
+    with open_map(path, sigma_m) as opened:
+        return window_of(opened, box, margin_m)
+
+
+def window_of(
+    opened: OpenMap, box: tuple[float, float, float, float], margin_m: float = 0.0
+) -> Grid:
+    """Read the cells in and around a box of an open map.
+
+    Raises
+    ------
+    NoOverlapError
+        The box lies off the map.
+    """
+    t = opened.source.transform
+    rows, cols = opened.shape
+    c0 = max(0, math.floor((box[0] - margin_m - t.c) / t.a) - 3)
+    c1 = min(cols, math.ceil((box[2] + margin_m - t.c) / t.a) + 3)
+    r0 = max(0, math.floor((t.f - box[3] - margin_m) / -t.e) - 3)
+    r1 = min(rows, math.ceil((t.f - box[1] + margin_m) / -t.e) + 3)
+    if r0 >= r1 or c0 >= c1:
+        raise NoOverlapError(
+            f"{opened.path}: does not reach easting {box[0]:.1f} to {box[2]:.1f}, northing "
+            f"{box[1]:.1f} to {box[3]:.1f}; give positions on the map"
+        )
+    return opened.read(slice(r0, r1), slice(c0, c1))
+
+
+def reduced_weights(path: Path, reduced: Reduced, weights: Mapping[str, float]) -> FloatArray:
+    """Return the blocks' mean weight from a region map of the full resolution, band by band.
 
     Raises
     ------
     InputError
-        The map has no square metres to plan in (geographic or without georeference).
+        No region map, or one of another grid than the map.
     """
-    with rasterio.open(path) as source:
-        if source.crs is None or source.crs.is_geographic:
-            raise InputError(
-                f"{path}: a map of {source.width} x {source.height} cells needs a projected CRS in "
-                "metres; warp it: gdalwarp -t_srs EPSG:<UTM zone> in.tif out.tif"
-            )
-        block = max(1, math.ceil(math.sqrt(source.width * source.height / REDUCED_CELLS)))
-        rows, cols = source.height // block, source.width // block
-        bands = [1]
+    by_code = np.array([weights.get(name, 1.0) for name in REGION_CLASSES])
+    rows, cols = reduced.grid.shape
+    out = np.empty((rows, cols))
+    with rasterio.open(existing_file(path)) as source:
         names = [(d or "").lower() for d in source.descriptions]
-        if "sigma" in names:
-            bands.append(names.index("sigma") + 1)
-        out = np.full((len(bands), rows, cols), np.nan)
-        step = max(1, 8_000_000 // (source.width * block))
+        if "class" not in names:
+            raise InputError(
+                f"{path}: lacks the band class; make it from this map: bathynav regions MAP.tif"
+            )
+        refuse_other_frame(path, source.transform, (source.height, source.width), reduced)
+        step = max(1, _BAND_CELLS // (source.width * reduced.block))
         for first in range(0, rows, step):
             last = min(rows, first + step)
-            window = Window(0, first * block, cols * block, (last - first) * block)
-            values = (
-                source.read(bands, window=window, masked=True).astype(np.float32).filled(np.nan)
+            window: Any = rasterio.windows.Window(
+                0, first * reduced.block, cols * reduced.block, (last - first) * reduced.block
             )
-            shaped = values.reshape(len(bands), last - first, block, cols, block)
-            # A mean with a NaN is NaN; the worst sigma of a block stands for it.
-            out[0, first:last] = shaped[0].mean(axis=(1, 3))
-            if len(bands) > 1:
-                out[1, first:last] = shaped[1].max(axis=(1, 3))
-        t = source.transform
-        sigma = out[1] if len(bands) > 1 and np.isfinite(out[1]).any() else None
-        grid = Grid(
-            out[0], t.c, t.f, t.a * block, source.crs.to_string(), sigma,
-            cell_height_m=-t.e * block,
-        )  # fmt: skip
-    return grid, block
-
-
-def window_along(path: Path, easting_m: FloatArray, northing_m: FloatArray, like: Grid) -> Grid:
-    """Read, at full resolution, the least window of the map that holds a stretch of a route.
-
-    Parameters
-    ----------
-    like : a grid of the same map, for its CRS and datum.
-    """
-    with rasterio.open(path) as source:
-        t = source.transform
-        c0 = max(0, math.floor((easting_m.min() - t.c) / t.a) - 3)
-        c1 = min(source.width, math.ceil((easting_m.max() - t.c) / t.a) + 3)
-        r0 = max(0, math.floor((t.f - northing_m.max()) / -t.e) - 3)
-        r1 = min(source.height, math.ceil((t.f - northing_m.min()) / -t.e) + 3)
-        names = [(d or "").lower() for d in source.descriptions]
-        window = Window(c0, r0, c1 - c0, r1 - r0)
-
-        def read(band: int) -> FloatArray:
-            values: Any = source.read(band, window=window, masked=True)
-            return np.asarray(values.astype(np.float64).filled(np.nan))
-
-        sigma = read(names.index("sigma") + 1) if "sigma" in names else None
-        if sigma is not None and like.sigma_m is None:
-            sigma = None
-        return replace(
-            like, elevation_m=read(1), sigma_m=sigma, count=None,
-            west_m=t.c + c0 * t.a, north_m=t.f + r0 * t.e, cell_m=t.a, cell_height_m=-t.e,
-        )  # fmt: skip
-
-
-def stretches(easting_m: FloatArray, northing_m: FloatArray, most_m: float) -> list[slice]:
-    """Divide a route into stretches whose bounding boxes are at most `most_m` on a side.
-
-    Neighbouring stretches share a waypoint, so that every segment belongs to one.
-    """
-    out = []
-    first = 0
-    while first < len(easting_m) - 1:
-        span = np.maximum(
-            np.maximum.accumulate(easting_m[first:]) - np.minimum.accumulate(easting_m[first:]),
-            np.maximum.accumulate(northing_m[first:]) - np.minimum.accumulate(northing_m[first:]),
-        )
-        last = first + max(1, int(np.searchsorted(span, most_m)) - 1)
-        out.append(slice(first, min(last, len(easting_m) - 1) + 1))
-        first = min(last, len(easting_m) - 1)
+            code = source.read(names.index("class") + 1, window=window)
+            by_cell = by_code[np.clip(code, 0, len(by_code) - 1)]
+            out[first:last] = _blocks(by_cell, reduced.block).mean(axis=(1, 3))
     return out
 
 
-def prove_at_full_resolution(path: Path, plan: Plan, like: Grid) -> Plan:
-    """Make the depths of a reduced plan's route anew over the raster as stored, and prove them.
-
-    Parameters
-    ----------
-    plan : found on the reduced map.
-    like : the reduced map, whose CRS and use of sigma count.
-
-    Returns
-    -------
-    The plan with the proved route; its cost is of the reduced map's weights. Without a route and with
-    the reason where the full resolution breaks a limit.
-    """
-    if plan.route is None:
-        return plan
-    easting, northing = plan.route.easting_m, plan.route.northing_m
-    where = stretches(easting, northing, _WINDOW_CELLS * like.cell_m / plan_block(path, like))
-    parts = [
-        SurfaceGround(_part(window_along(path, easting[w], northing[w], like), plan.surface))
-        for w in where
-    ]
-    w = prove(plan.surface, easting, northing, ground=WindowedGround(where, parts))
-    if w.problem:
-        reason = (
-            f"at full resolution, near {w.worst[0]:.1f},{w.worst[1]:.1f}: {w.problem}; cut the map to the "
-            "area of the route (gdal_translate -projwin) to plan at full resolution"
-        )
-        return replace(plan, route=None, reason=reason)
-    middle = 0.5 * (w.altitude_m[1:] + w.altitude_m[:-1]) - plan.surface.limits.floor_m
-    _, _, weight = SurfaceGround(plan.surface).at(easting, northing)
-    rate = 0.5 * (weight[1:] + weight[:-1])
-    rate = rate + plan.surface.terms.altitude_per_m * np.maximum(0.0, middle)
-    cost = float((rate * np.diff(w.distance_m)).sum())
-    return replace(plan, route=route_of(w, cost, like.crs))
-
-
-def plan_block(path: Path, like: Grid) -> float:
-    """Return the number of full-resolution cells along a side of a reduced cell."""
-    with rasterio.open(path) as source:
-        return like.cell_m / float(source.transform.a)
-
-
-def _part(grid: Grid, surface: Surface) -> Surface:
-    """Return a window's surface under the limits and k of the reduced one."""
-    limits = surface.limits
-    sigma = clearance_sigma(
-        grid.elevation_m, (grid.cell_m, grid.cell_north_m), grid.sigma_m,
-        limits.sigma_position_m, limits.sigma_depth_m,
-    )  # fmt: skip
-    return build_surface(
-        grid, limits, surface.terms, None, sigma, surface.k, submerged=np.isfinite(surface.top_m)
+def refuse_other_frame(
+    path: Path, transform: Any, shape: tuple[int, int], reduced: Reduced
+) -> None:
+    """Refuse a raster that is not on the grid of the large map."""
+    grid, (width, height) = reduced.grid, reduced.cell_m
+    near = 0.01 * width
+    same = (
+        abs(transform.c - grid.west_m) < near
+        and abs(transform.f - grid.north_m) < near
+        and abs(transform.a - width) * shape[1] < near
+        and abs(-transform.e - height) * shape[0] < near
+        and (shape[0] // reduced.block, shape[1] // reduced.block) == grid.shape
     )
+    if not same:
+        raise InputError(
+            f"{path}: {shape[0]} x {shape[1]} cells of {transform.a:g} m from "
+            f"{transform.c:.2f},{transform.f:.2f} are not the map's; make it from this map: "
+            "bathynav regions MAP.tif"
+        )

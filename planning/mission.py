@@ -5,65 +5,89 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from perception.records import FloatArray, Grid, InputError
-from planning.finish import exact_cost, prove
-from planning.limits import VehicleLimits
-from planning.planner import Plan, end_node, plan_route
+from perception.records import FloatArray, InputError
+from planning.ends import end_node
+from planning.finish import POSITION_DIGITS, prove
+from planning.planner import Plan, PlanConfig, plan_on_surface
+from planning.problem import Problem
 from planning.route import route_of
+from planning.surface import Surface
 from planning.tour import best_order, leg_costs
 
+Place = tuple[float, float]
 
-def plan_mission(
-    grid: Grid,
-    stops: list[tuple[float, float]],
-    limits: VehicleLimits | None = None,
-    **options: Any,
+
+def solve_mission(
+    problem: Problem, stops: list[Place], config: PlanConfig | None = None
 ) -> tuple[Plan, list[int]]:
     """Visit all stops, the first first and the last last, the others in the cheapest order.
+
+    The risk is shared out over the whole mission.
 
     Parameters
     ----------
     stops : (easting, northing) of start, goals between, and goal.
-    options : of `plan_route`.
 
     Returns
     -------
     The plan of the whole (its `reason` names the leg that failed) and the order of the stops.
+
+    Raises
+    ------
+    InputError
+        Fewer than two stops, one that no vehicle can stand on, or two in one place.
     """
-    limits = limits or VehicleLimits()
+    config = config or PlanConfig()
     if len(stops) < 2:
         raise InputError("a mission needs a start and a goal")
-    first = plan_route(grid, stops[0], stops[-1], limits, **options)
-    nodes = [end_node(first.surface, stop, f"stop {i}") for i, stop in enumerate(stops)]
-    order = best_order(leg_costs(first.surface, nodes))
+    for (i, a), (j, b) in itertools.combinations(enumerate(stops), 2):
+        if math.dist(a, b) < 10.0**-POSITION_DIGITS:
+            raise InputError(f"stops {i} and {j} are the same place ({a[0]:.2f},{a[1]:.2f})")
+    sigma = problem.clearance_sigma_m()
+    length = 1.3 * sum(math.dist(a, b) for a, b in itertools.pairwise(stops))
+    while True:
+        k, patches = problem.factor(length)
+        surface = problem.surface(sigma, 0.0 if sigma is None else k)
+        nodes = [end_node(surface, stop, f"stop {i}") for i, stop in enumerate(stops)]
+        order = best_order(leg_costs(surface, nodes))
+        plan = replace(
+            _along(surface, [stops[i] for i in order], order, problem.grid.crs, config),
+            patches=patches,
+        )
+        if sigma is None or plan.route is None or plan.route.length_m <= length:
+            return plan, order
+        length = 1.05 * plan.route.length_m
+
+
+def _along(
+    surface: Surface, stops: list[Place], names: list[int], crs: str, config: PlanConfig
+) -> Plan:
+    """Plan the legs one after the other; each sets off the way the last one came in."""
+    limits = surface.limits
     legs: list[Plan] = []
-    for a, b in itertools.pairwise(order):
-        heading_deg = limits.start_heading_deg
-        if legs and legs[-1].route is not None:
-            # The next leg sets off the way the last one came in: no kink where they meet.
-            route = legs[-1].route
-            east, north = np.diff(route.easting_m[-2:])[0], np.diff(route.northing_m[-2:])[0]
-            heading_deg = math.degrees(math.atan2(east, north))
+    heading_deg = limits.start_heading_deg
+    for i, (a, b) in enumerate(itertools.pairwise(stops)):
         eased = replace(
             limits,
             start_heading_deg=heading_deg,
-            goal_heading_deg=limits.goal_heading_deg if b == order[-1] else math.nan,
+            goal_heading_deg=limits.goal_heading_deg if i == len(stops) - 2 else math.nan,
         )
-        leg = plan_route(grid, stops[a], stops[b], eased, **options)
+        leg = plan_on_surface(replace(surface, limits=eased), crs, a, b, config)
         if leg.route is None:
-            reason = f"leg from stop {a} to stop {b}: {leg.reason}"
-            return replace(leg, route=None, reason=reason), order
+            reason = f"leg from stop {names[i]} to stop {names[i + 1]}: {leg.reason}"
+            return replace(leg, reason=reason)
         legs.append(leg)
-    return _joined(legs, grid), order
+        east = float(np.diff(leg.route.easting_m[-2:])[0])
+        north = float(np.diff(leg.route.northing_m[-2:])[0])
+        heading_deg = math.degrees(math.atan2(east, north))
+    return _joined(surface, legs, crs)
 
 
-def _joined(legs: list[Plan], grid: Grid) -> Plan:
-    """Join the legs' positions and prove the whole with the safest of their surfaces."""
-    surface = max((leg.surface for leg in legs), key=lambda s: s.k)
+def _joined(surface: Surface, legs: list[Plan], crs: str) -> Plan:
+    """Join the legs' positions and prove the whole."""
     routes = [leg.route for leg in legs if leg.route is not None]
 
     def chain(name: str) -> FloatArray:
@@ -85,4 +109,4 @@ def _joined(legs: list[Plan], grid: Grid) -> Plan:
     )
     if w.problem:
         return replace(total, route=None, reason=f"where two legs meet: {w.problem}")
-    return replace(total, route=route_of(w, exact_cost(surface, w), grid.crs))
+    return replace(total, route=route_of(surface, w, crs))

@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,16 +14,19 @@ from perception.records import BoolArray, FloatArray, Grid, InputError, Progress
 from planning.bound import lower_bound
 from planning.corridor import make_corridor
 from planning.cost import CostTerms
+from planning.currents import Currents
 from planning.curve import waypoints
+from planning.ends import end_node
 from planning.failure import Blockage, explain_barrier, explain_limits
-from planning.finish import POSITION_DIGITS, exact_cost, finish
-from planning.layers import cost_to_go, layered_path, thinned
+from planning.finish import POSITION_DIGITS, finish
+from planning.layers import layered_path
 from planning.limits import VehicleLimits
 from planning.polish import RADIUS_RESERVE, Candidate, control_spacing, polish, smooth_guide
+from planning.problem import Problem
 from planning.pyramid import guided_search
-from planning.risk import clearance_factor, clearance_sigma, patches_crossed
 from planning.route import Route, route_of
-from planning.surface import Surface, build_surface, cautious
+from planning.surface import Surface, cautious
+from planning.thinning import cost_to_go, thinned
 
 logger = logging.getLogger(__name__)
 
@@ -62,6 +65,7 @@ class Plan:
     reason : empty where solved; else which limit blocks, where, and the way out.
     grid_cost : limit-free grid search at the floor; NaN where even that finds no way.
     lower_bound : certified: no route within the limits costs less.
+    patches : independent patches of map error along the route, from which k follows.
     stages_s : seconds per stage; `costs` the cost of each candidate after polishing.
     """
 
@@ -69,10 +73,9 @@ class Plan:
     reason: str
     grid_cost: float
     lower_bound: float
-    k: float
-    patches: float
     surface: Surface
     grid_path: FloatArray
+    patches: float = 1.0
     stages_s: dict[str, float] = field(default_factory=dict)
     costs: dict[str, float] = field(default_factory=dict)
     blockage: Blockage | None = None
@@ -80,6 +83,11 @@ class Plan:
     @property
     def solved(self) -> bool:
         return self.route is not None
+
+    @property
+    def k(self) -> float:
+        """How many sigmas the route keeps above its floor."""
+        return self.surface.k
 
     @property
     def ratio(self) -> float:
@@ -99,6 +107,7 @@ def plan_route(
     config: PlanConfig | None = None,
     forbidden: BoolArray | None = None,
     position_sigma_m: FloatArray | None = None,
+    currents: Currents | None = None,
     progress: Progress = silent,
 ) -> Plan:
     """Plan a low route from start to goal (easting, northing) and prove its clearance.
@@ -108,36 +117,42 @@ def plan_route(
     weight : (rows, cols) `w` of the cost; 1 everywhere without.
     forbidden : (rows, cols) True in no-go areas.
     position_sigma_m : (rows, cols) expected position error, 1-sigma per axis.
+    currents : of the water; None still.
 
     Raises
     ------
     InputError
         Start or goal is off the map, on no data, or where the limits leave no water.
     """
-    limits, terms, config = limits or VehicleLimits(), terms or CostTerms(), config or PlanConfig()
-    sigma = clearance_sigma(
-        grid.elevation_m, (grid.cell_m, grid.cell_north_m), grid.sigma_m,
-        limits.sigma_position_m if position_sigma_m is None else position_sigma_m,
-        limits.sigma_depth_m,
+    config = config or PlanConfig()
+    problem = Problem(
+        grid, limits or VehicleLimits(), terms or CostTerms(), weight, forbidden, position_sigma_m,
+        currents, config.risk, config.correlation_m,
     )  # fmt: skip
-    correlation = config.correlation_m
-    if not np.isfinite(correlation):
-        correlation = 10.0 * max(grid.cell_m, grid.cell_north_m)
-    if terms.position_per_m > 0 and position_sigma_m is not None:
-        dear = terms.position_per_m * np.nan_to_num(position_sigma_m)
-        weight = dear + (1.0 if weight is None else weight)
-    submerged = not _dry(grid, start, goal)
+    return solve(problem, start, goal, config, progress)
+
+
+def solve(
+    problem: Problem,
+    start: tuple[float, float],
+    goal: tuple[float, float],
+    config: PlanConfig,
+    progress: Progress = silent,
+) -> Plan:
+    """Plan from start to goal; k sigma is set anew where the route comes out longer than thought."""
     straight = float(np.hypot(goal[0] - start[0], goal[1] - start[1]))
     if straight < 10.0**-POSITION_DIGITS:
         raise InputError(
             f"start and goal are the same place ({start[0]:.2f},{start[1]:.2f}); move one of them"
         )
+    problem = replace(problem, submerged=not _dry(problem.grid, start, goal))
+    sigma = problem.clearance_sigma_m()
     length = 1.3 * straight
     while True:
-        patches = patches_crossed(length, correlation)
-        k = 0.0 if sigma is None else clearance_factor(config.risk, patches)
-        surface = build_surface(grid, limits, terms, weight, sigma, k, forbidden, submerged)
-        plan = _plan_on(surface, grid, start, goal, config, k, patches, progress)
+        k, patches = problem.factor(length)
+        surface = problem.surface(sigma, 0.0 if sigma is None else k)
+        plan = plan_on_surface(surface, problem.grid.crs, start, goal, config, progress)
+        plan = replace(plan, patches=patches)
         if sigma is None or plan.route is None or plan.route.length_m <= length:
             return plan
         # The route came out longer than the risk was shared out for: share it anew.
@@ -153,69 +168,85 @@ def _dry(grid: Grid, start: tuple[float, float], goal: tuple[float, float]) -> b
     return bool(np.nanmin(grid.elevation_m) > 0 and (ends > 0).all())
 
 
-def _plan_on(
+class _Laps:
+    """Seconds per stage, and what is told of them."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.stages: dict[str, float] = {}
+        self._clock, self._progress = time.perf_counter(), progress
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.stages[stage] = self.stages.get(stage, 0.0) + now - self._clock
+        self._clock = now
+        self._progress("planning", min(len(self.stages), _STAGES), _STAGES)
+
+
+# Stages of a plan that is found: grid, bound, guides, OMPL, polish, proof.
+_STAGES = 6
+
+
+def plan_on_surface(
     surface: Surface,
-    grid: Grid,
+    crs: str,
     start: tuple[float, float],
     goal: tuple[float, float],
     config: PlanConfig,
-    k: float,
-    patches: float,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> Plan:
-    stages: dict[str, float] = {}
-    clock = time.perf_counter()
-
-    def lap(stage: str) -> None:
-        nonlocal clock
-        now = time.perf_counter()
-        stages[stage] = stages.get(stage, 0.0) + now - clock
-        clock = now
-
+    """Plan on a surface whose clearance is settled; arguments and errors of `plan_route`."""
+    laps = _Laps(progress)
     node_a = end_node(surface, start, "start")
     node_b = end_node(surface, goal, "goal")
     grid_cost, nodes = guided_search(surface, node_a, node_b, config.neighbours)
-    lap("grid_s")
+    laps.lap("grid_s")
     bound = lower_bound(surface, start, goal)
-    lap("bound_s")
+    laps.lap("bound_s")
     ends = np.array([surface.local(np.array(p[0]), np.array(p[1])) for p in (start, goal)])
     if not np.isfinite(grid_cost):
         parted = explain_barrier(surface, node_a, node_b)
         return Plan(
-            None, parted.reason, math.nan, bound, k, patches, surface, np.zeros((0, 2)), stages,
+            None, parted.reason, math.nan, bound, surface, np.zeros((0, 2)), stages_s=laps.stages,
             blockage=parted,
         )  # fmt: skip
     guide = np.column_stack([nodes[:, 1] * surface.cell_m[0], nodes[:, 0] * surface.cell_m[1]])
     guide = np.concatenate([ends[:1], guide[1:-1], ends[1:]])
+    candidates = _candidates(surface, guide, ends, config, laps)
+    route, problem = _best_proved(surface, candidates, crs)
+    if route is None:
+        candidates += _second_tries(surface, candidates, ends)
+        route, problem = _best_proved(surface, candidates, crs)
+    laps.lap("proof_s")
+    blocked: Blockage | None = None
+    if route is None:
+        blocked = explain_limits(surface, candidates, guide, problem)
+        laps.lap("explain_s")
+    return Plan(
+        route, "" if blocked is None else blocked.reason, grid_cost, bound, surface, guide,
+        stages_s=laps.stages, costs={c.source: c.cost for c in candidates}, blockage=blocked,
+    )  # fmt: skip
+
+
+def _candidates(
+    surface: Surface, guide: FloatArray, ends: FloatArray, config: PlanConfig, laps: _Laps
+) -> list[Candidate]:
+    """Return the polished guides, what OMPL makes of the best of them, and that polished in full."""
     # Barred ground a cell wider while looking: samples cannot miss its corners then.
     careful = cautious(surface, ends) if surface.barred.any() else surface
     candidates = _from_guides(careful, guide, ends, config)
     if careful is not surface and all(c.breach > 0 for c in candidates):
         careful = surface
         candidates += _from_guides(careful, guide, ends, config)
-    lap("guides_s")
+    laps.lap("guides_s")
     if config.planner != "none":
         found = _ompl(careful, min(candidates, key=_merit), ends, config)
         if found is not None:
             candidates.append(_polished(careful, found, "ompl"))
-        lap("ompl_s")
+        laps.lap("ompl_s")
     best = min(candidates, key=_merit)
     candidates.append(polish(careful, best.points, _SWEEPS, rounds=2, source="final"))
-    lap("polish_s")
-    route, problem = _best_proved(surface, candidates, grid.crs)
-    if route is None:
-        candidates += _second_tries(surface, candidates, ends)
-        route, problem = _best_proved(surface, candidates, grid.crs)
-    lap("proof_s")
-    costs = {c.source: c.cost for c in candidates}
-    blocked: Blockage | None = None
-    if route is None:
-        blocked = explain_limits(surface, candidates, guide, problem)
-        lap("explain_s")
-    return Plan(
-        route, "" if blocked is None else blocked.reason, grid_cost, bound, k, patches, surface,
-        guide, stages, costs, blocked,
-    )  # fmt: skip
+    laps.lap("polish_s")
+    return candidates
 
 
 # Sweeps of the polish: a first look at every guide with samples two cells apart, then the best in full.
@@ -315,67 +346,12 @@ def _best_proved(
     for candidate in sorted(candidates, key=_merit):
         w = finish(surface, candidate.points)
         if not w.problem:
-            return route_of(w, exact_cost(surface, w), crs), ""
+            return route_of(surface, w, crs), ""
         problem = problem or w.problem
         if candidate.breach == 0:
             # The plan kept its limits at its samples; a little more in reserve keeps them between.
             careful = polish(surface, candidate.points, sweeps=20, rounds=1, reserve_m=_CAUTION_M)
             w = finish(surface, careful.points)
             if not w.problem:
-                return route_of(w, exact_cost(surface, w), crs), ""
+                return route_of(surface, w, crs), ""
     return None, problem
-
-
-def end_node(surface: Surface, end: tuple[float, float], name: str) -> tuple[int, int]:
-    """Return the node nearest to start or goal that a route may use; say why there is none.
-
-    Raises
-    ------
-    InputError
-        Off the map, on no data, on land, too deep, or within a no-go area.
-    """
-    rows, cols = surface.shape
-    x, y = surface.local(np.array(end[0]), np.array(end[1]))
-    col, row = float(x) / surface.cell_m[0], float(y) / surface.cell_m[1]
-    at = f"{name} {end[0]:.2f},{end[1]:.2f}"
-    if not (0 <= row <= rows - 1 and 0 <= col <= cols - 1):
-        west, north = surface.origin_m
-        raise InputError(
-            f"{at} lies off the map, whose cell centres span easting {west:.2f} to "
-            f"{west + (cols - 1) * surface.cell_m[0]:.2f} and northing "
-            f"{north - (rows - 1) * surface.cell_m[1]:.2f} to {north:.2f}; move it inside"
-        )
-    square = {
-        (i, j)
-        for i in (int(np.floor(row)), int(np.ceil(row)))
-        for j in (int(np.floor(col)), int(np.ceil(col)))
-    }
-    for i, j in sorted(square):
-        if surface.barred[i, j]:
-            raise InputError(f"{at} {_why_barred(surface, i, j)}")
-    return round(row), round(col)
-
-
-def _why_barred(surface: Surface, row: int, col: int) -> str:
-    bottom, lower = surface.bottom_m[row, col], surface.lower_m[row, col]
-    limits = surface.limits
-    if not np.isfinite(bottom):
-        return "lies on or beside a cell without data; move it to mapped ground"
-    if not np.isfinite(lower):
-        return "lies where the map has a height but no sigma; move it or give --map-sigma"
-    if lower > surface.top_m:
-        return (
-            f"lies in rock or too shallow: the bottom at {bottom:.2f} m needs the vehicle at "
-            f"{lower:.2f} m, above the water's surface; move it to deeper water"
-        )
-    if bottom + limits.ceiling_m < -limits.depth_max_m:
-        return (
-            f"is too deep: {limits.ceiling_m:g} m above the bottom at {bottom:.2f} m is still below "
-            f"depth_max_m {limits.depth_max_m:g}; raise depth_max_m or ceiling_m"
-        )
-    if bottom + limits.ceiling_m < lower:
-        return (
-            f"lies where floor and k sigma need {lower - bottom:.2f} m of altitude, above the "
-            f"ceiling of {limits.ceiling_m:g} m; raise ceiling_m or --risk"
-        )
-    return "lies in a no-go area; move it out"

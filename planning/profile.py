@@ -14,6 +14,8 @@ import math
 import numpy as np
 from numba import njit
 
+from planning.currents import through_water
+
 
 @njit(cache=True)
 def cone_envelope(s, lower, n, slope_up, slope_down, z):  # type: ignore[no-untyped-def]
@@ -97,6 +99,23 @@ def sample_stack(stack, width, height, x, y):  # type: ignore[no-untyped-def]
     )
 
 
+@njit(cache=True)
+def _drift(stack, width, height, x, y):  # type: ignore[no-untyped-def]
+    """Return the current of the nearest cell at local (x, y): fields of currents are smooth."""
+    r = min(max(round(y / height), 0), stack.shape[0] - 1)
+    c = min(max(round(x / width), 0), stack.shape[1] - 1)
+    return stack[r, c, 4], stack[r, c, 5]
+
+
+@njit(cache=True)
+def water_per_ground(stack, width, height, x0, y0, x1, y1):  # type: ignore[no-untyped-def]
+    """Return metres of water per metre of ground between two local positions; 1 without a current."""
+    if stack.shape[2] < 6:
+        return 1.0
+    ux, uy = _drift(stack, width, height, 0.5 * (x0 + x1), 0.5 * (y0 + y1))
+    return through_water(x1 - x0, y1 - y0, ux, uy)
+
+
 # Price of breaking a limit while the search is still on its way to keeping it, per metre of path and
 # metre of excess: far above any honest cost density, so that the optimum breaks nothing.
 EXCESS_PRICE = 50.0
@@ -112,7 +131,7 @@ def path_cost(stack, width, height, px, py, n, rules, work, hull):  # type: igno
     px, py : (>= n,) local coordinates of the samples.
     rules : (9,) price a, slope up, slope down, floor, ceiling, least height, top, margin, price of
         excess over the ceiling.
-    work : (>= n, 5) scratch; on return column 0 holds the distance, column 3 the heights.
+    work : (>= n, 6) scratch; on return column 0 holds the distance, column 3 the heights.
     hull : (>= n,) integer scratch.
 
     Returns
@@ -146,6 +165,7 @@ def path_cost(stack, width, height, px, py, n, rules, work, hull):  # type: igno
         dz = z[i] - z[i - 1]
         # density + a z is w + a (altitude - floor), never below w since z >= bottom + floor.
         rate = 0.5 * (density[i] + density[i - 1] + a * (z[i] + z[i - 1]))
+        rate *= water_per_ground(stack, width, height, px[i - 1], py[i - 1], px[i], py[i])
         cost += rate * math.sqrt(ds * ds + dz * dz)
         excess_total += max(0.0, z[i] - upper[i]) * ds
     return (
@@ -156,4 +176,4 @@ def path_cost(stack, width, height, px, py, n, rules, work, hull):  # type: igno
 
 def make_work(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return scratch for `path_cost` of up to n samples."""
-    return np.empty((n, 5)), np.empty(n, np.int64)
+    return np.empty((n, 6)), np.empty(n, np.int64)

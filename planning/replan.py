@@ -15,9 +15,9 @@ import numpy as np
 
 from perception.files import existing_file
 from perception.records import FloatArray, InputError
+from planning.ends import end_node
 from planning.field import search
-from planning.finish import exact_cost, finish
-from planning.planner import end_node
+from planning.finish import finish
 from planning.polish import control_spacing, polish, smooth_guide
 from planning.route import Route, route_of
 from planning.surface import Surface, cautious
@@ -119,6 +119,6 @@ def replan(
     for candidate in sorted(candidates, key=lambda c: (c.breach > 0, c.cost)):
         w = finish(surface, candidate.points, start_height_m=-state.depth_m)
         if not w.problem:
-            return route_of(w, exact_cost(surface, w), crs), ""
+            return route_of(surface, w, crs), ""
         problem = problem or w.problem
     return None, problem

@@ -13,10 +13,12 @@ from scipy import ndimage
 
 from perception.records import BoolArray, FloatArray, Grid
 from planning.cost import CostTerms
+from planning.currents import STRONGEST, Currents
 from planning.limits import VehicleLimits
 
-# Layers of `Surface.stack`.
-LOWER, BOTTOM, WEIGHT, BAR = 0, 1, 2, 3
+# Layers of `Surface.stack`; the last two are there only where there is a current: its share of the
+# vehicle's speed along local x (east) and y (south).
+LOWER, BOTTOM, WEIGHT, BAR, DRIFT_X, DRIFT_Y = 0, 1, 2, 3, 4, 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +31,8 @@ class Surface:
     lower_m : (rows, cols) least height of the vehicle: bottom + floor + k sigma; NaN no data.
     barred : (rows, cols) True where no route may pass: no data, no-go area, or no water left between
         floor and surface.
-    stack : (rows, cols, 4) float32 layers lower, bottom, weight, bar: filled from the nearest cell
-        where there is no data; bar is the distance (m) into barred ground, 0 outside it.
+    stack : (rows, cols, 4 or 6) float32 layers lower, bottom, weight, bar, drift: filled from the nearest
+        cell where there is no data; bar is the distance (m) into barred ground, 0 outside it.
     origin_m : easting and northing of the first cell's centre.
     cell_m : width and height of a cell.
     top_m : height of the water's surface above the datum; infinite on dry stand-ins.
@@ -57,6 +59,19 @@ class Surface:
         """Least height that the depth limit allows."""
         return -self.limits.depth_max_m
 
+    @property
+    def drifts(self) -> bool:
+        """Whether there is a current."""
+        return bool(self.stack.shape[2] > DRIFT_X)
+
+    def reversed(self) -> Surface:
+        """Return the surface on which a path costs what its reverse does on this one."""
+        if not self.drifts:
+            return self
+        stack = self.stack.copy()
+        stack[..., DRIFT_X:] *= -1.0
+        return replace(self, stack=stack)
+
     def local(self, easting_m: FloatArray, northing_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return local x, y of map coordinates."""
         return (
@@ -78,6 +93,7 @@ def build_surface(
     k: float = 0.0,
     forbidden: BoolArray | None = None,
     submerged: bool = True,
+    currents: Currents | None = None,
 ) -> Surface:
     """Make the planners' rasters from a map.
 
@@ -87,6 +103,7 @@ def build_surface(
     sigma_m : (rows, cols) what the clearance must cover `k` times; NaN bars a cell when k > 0.
     forbidden : (rows, cols) True in no-go areas.
     submerged : whether height 0 is the water's surface, which no route may leave.
+    currents : of the water; None still.
     """
     bottom = np.asarray(grid.elevation_m, float)
     lower = bottom + limits.floor_m
@@ -102,11 +119,16 @@ def build_surface(
     w = np.where(np.isfinite(w), w, 1.0)
     if terms.uncertainty_per_m > 0 and sigma_m is not None:
         w = w + terms.uncertainty_per_m * np.nan_to_num(sigma_m)
+    drift: tuple[FloatArray, ...] = ()
+    if currents is not None:
+        east, north = currents.on(grid)
+        drift = (east / limits.speed_m_s, -north / limits.speed_m_s)
+        barred |= np.hypot(*drift) > STRONGEST
     return Surface(
         bottom_m=bottom,
         lower_m=lower,
         barred=barred,
-        stack=_stack(bottom, lower, w, barred, (grid.cell_m, grid.cell_north_m)),
+        stack=_stack(bottom, lower, w, barred, (grid.cell_m, grid.cell_north_m), drift),
         origin_m=(grid.west_m + 0.5 * grid.cell_m, grid.north_m - 0.5 * grid.cell_north_m),
         cell_m=(grid.cell_m, grid.cell_north_m),
         top_m=top,
@@ -122,10 +144,13 @@ def _stack(
     weight: FloatArray,
     barred: BoolArray,
     cell_m: tuple[float, float],
+    drift: tuple[FloatArray, ...],
 ) -> FloatArray:
-    stack = np.empty((*bottom.shape, 4), np.float32)
+    stack = np.empty((*bottom.shape, 4 + len(drift)), np.float32)
     stack[..., LOWER], stack[..., BOTTOM], stack[..., WEIGHT] = lower, bottom, weight
     stack[..., BAR] = 0.0
+    for layer, values in enumerate(drift, start=DRIFT_X):
+        stack[..., layer] = values
     if not barred.any():
         return stack
     missing = ~(np.isfinite(lower) & np.isfinite(bottom))

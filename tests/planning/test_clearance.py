@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from perception.records import bilinear
-from planning.clearance import least_stand_off, polyline_extremes
+from planning.clearance import polyline_extremes
+from planning.stand_off import least_stand_off
 
 
 def test_a_saddle_cell_has_its_least_clearance_where_analysis_says():
@@ -82,6 +83,14 @@ def test_stand_off_from_a_wall_is_the_slant_distance():
         np.array([-4.0, -4.0]),
         30,
     )
-    # From column 12 at -4 the nearest rock is the wall's top edge: 3 across, 4 up.
-    assert_allclose(d, 5.0)
+    # From column 12 at -4 the nearest rock is square to the wall's face, which rises 20 m over a cell.
+    assert_allclose(d, 56.0 / np.sqrt(401.0), atol=2e-3)
     assert vertex == 1
+
+
+def test_stand_off_over_a_slope_is_the_distance_square_to_it():
+    # A plane of 45 deg, 6 m below the path: 6 / sqrt(2) square to it, between the cells' centres.
+    surface = np.tile(np.arange(60.0), (40, 1))
+    col = np.linspace(20.0, 30.0, 9)
+    d, _ = least_stand_off(surface, (1.0, 1.0), np.full(9, 20.3), col, col + 6.0, 40.0)
+    assert_allclose(d, 6.0 / np.sqrt(2.0), atol=2e-3)

@@ -10,8 +10,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from planning.cost import CostTerms
-from planning.field import neighbourhood, search
+from planning.field import search
 from planning.limits import VehicleLimits
+from planning.moves import neighbourhood
 from planning.surface import Surface, build_surface
 from tests.planning.terrains import canyon, flat, grid_of
 

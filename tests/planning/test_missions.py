@@ -20,9 +20,10 @@ from planning.dubins import dubins
 from planning.exports import gpx, qgc_plan
 from planning.finish import least_radius
 from planning.limits import VehicleLimits
-from planning.mission import plan_mission
+from planning.mission import solve_mission
 from planning.nogo import forbidden_cells
 from planning.planner import PlanConfig, plan_route
+from planning.problem import Problem
 from planning.replan import OldRoute, replan
 from planning.surface import build_surface
 from planning.tour import best_order
@@ -106,7 +107,7 @@ def test_many_stops_on_a_circle_are_visited_round_it():
 def test_a_mission_passes_all_its_stops_without_a_kink():
     grid = grid_of(gentle(160))
     stops = [at(grid, *p) for p in ((15, 15), (120, 130), (30, 120), (140, 20))]
-    plan, order = plan_mission(grid, stops, config=QUICK)
+    plan, order = solve_mission(Problem(grid), stops, QUICK)
     assert plan.route is not None, plan.reason
     assert order == [0, 2, 1, 3]
     found = brute_force(grid, plan.route)

@@ -138,7 +138,7 @@ def test_a_map_too_large_to_hold_is_planned_reduced_and_proved_in_full(tmp_path,
     write_map(tmp_path / "map.tif", grid)
     monkeypatch.setattr("planning.large.MOST_CELLS", 10_000)
     monkeypatch.setattr("planning.large.REDUCED_CELLS", 10_000)
-    monkeypatch.setattr("planning.large._WINDOW_CELLS", 64.0)
+    monkeypatch.setattr("planning.full_resolution._WINDOW_CELLS", 64.0)
     result = run(
         "--map", tmp_path / "map.tif", "--start", position(20.2, 30), "--goal", position(380, 361.3),
         "--out", tmp_path / "o", "--region-weights", "none", "--planner", "none", "--no-picture",

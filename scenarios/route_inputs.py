@@ -1,0 +1,244 @@
+"""What `bathynav plan` is given: options as they came, and the files they name, read and checked."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from perception.records import InputError, NoOverlapError
+
+if TYPE_CHECKING:
+    from perception.records import BoolArray, FloatArray, Grid, Progress
+    from planning.full_resolution import FullMap
+    from planning.large import Reduced
+    from planning.limits import VehicleLimits
+    from planning.problem import Problem
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """The options as they came; names are those of the command line."""
+
+    map_path: Path
+    start: tuple[float, float] | None
+    goal: tuple[float, float] | None
+    via: tuple[tuple[float, float], ...]
+    vehicle: Path | None
+    avoid: Path | None
+    regions: Path | None
+    region_weights: str
+    map_sigma: float | None
+    risk: float
+    error_correlation: float | None
+    position_sigma: Path | None
+    currents: str
+    cost_path: Path | None
+    survey: Path | None
+    swath: float
+    overlap: float
+    crossings: int
+    old_route: Path | None
+    travelled: float
+    planner: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The problem that the options pose.
+
+    Attributes
+    ----------
+    full : the map as stored, where it is too large to hold and the problem's is reduced; else None.
+    more : figures of the reading, for metrics.json.
+    """
+
+    problem: Problem
+    full: FullMap | None
+    more: dict[str, Any]
+
+
+def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked:
+    """Read the map and all that bears on it, for a route from start to goal."""
+    from mapping.rasters import read_map
+    from planning.full_resolution import FullMap
+    from planning.large import MOST_CELLS, raster_cells
+
+    cells = raster_cells(given.map_path)
+    reduced: Reduced | None = None
+    if cells > MOST_CELLS:
+        reduced = _reduce(given, cells, progress)
+        grid = reduced.grid
+    else:
+        grid = read_map(given.map_path, given.map_sigma)
+    _tell_of_sigma(given, grid, limits)
+    began = time.perf_counter()
+    weight = _weights(grid, given, reduced)
+    more: dict[str, Any] = {"regions_s": time.perf_counter() - began}
+    bars, errors = no_go(given.avoid, grid.crs), position_sigma(given.position_sigma)
+    problem = posed(given, grid, from_true_north(limits, grid, given.start, given.goal), weight)
+    if reduced is None:
+        return Asked(problem, None, more)
+    if given.error_correlation is None:
+        # Ten cells as stored, not ten blocks: fewer patches would take k for smaller than it is.
+        problem = replace(problem, correlation_m=10.0 * max(reduced.cell_m))
+    more |= {"reduced_cell_m": grid.cell_m, "map_cells": cells}
+    return Asked(problem, FullMap(given.map_path, given.map_sigma, reduced, bars, errors), more)
+
+
+def posed(given: Given, grid: Grid, limits: VehicleLimits, weight: FloatArray | None) -> Problem:
+    """Return the problem on a grid that is held."""
+    from planning.cost import read_terms
+    from planning.current_files import read_currents
+    from planning.problem import Problem
+
+    return Problem(
+        grid=grid,
+        limits=limits,
+        terms=read_terms(given.cost_path),
+        weight=weight,
+        forbidden=no_go(given.avoid, grid.crs)(grid),
+        position_sigma_m=position_sigma(given.position_sigma)(grid),
+        currents=read_currents(given.currents, grid) if given.currents else None,
+        risk=given.risk,
+        correlation_m=math.nan if given.error_correlation is None else given.error_correlation,
+    )
+
+
+def read_around(
+    given: Given, limits: VehicleLimits, box: tuple[float, float, float, float], margin_m: float
+) -> Problem:
+    """Pose the problem of a survey or a replanning; of a large map only what lies around it is read."""
+    from mapping.rasters import read_map
+    from planning.large import MOST_CELLS, raster_cells, read_window
+
+    if raster_cells(given.map_path) > MOST_CELLS:
+        grid = read_window(given.map_path, box, margin_m, given.map_sigma)
+        if grid.elevation_m.size > MOST_CELLS:
+            raise InputError(
+                f"{given.map_path}: {grid.elevation_m.size / 1e6:.0f} million cells lie around what is "
+                f"asked for, more than {MOST_CELLS / 1e6:.0f}; divide it, or coarsen the map: "
+                "gdal_translate -r average -tr"
+            )
+    else:
+        grid = read_map(given.map_path, given.map_sigma)
+    _tell_of_sigma(given, grid, limits)
+    weight = None
+    if given.old_route is not None:
+        weight = _weights(grid, given, None)
+    return posed(given, grid, limits, weight)
+
+
+def _reduce(given: Given, cells: int, progress: Progress) -> Reduced:
+    from planning.large import read_reduced, reading_seconds
+
+    logger.warning(
+        "%s: %.0f million cells, too many to hold; about %.0f s of reading, then the route is planned "
+        "on block means and proved at full resolution; gaps narrower than a block are not looked for",
+        given.map_path, cells / 1e6, reading_seconds(cells),
+    )  # fmt: skip
+    return read_reduced(given.map_path, given.map_sigma, progress)
+
+
+def _tell_of_sigma(given: Given, grid: Grid, limits: VehicleLimits) -> None:
+    """Warn where the clearance covers no error at all: the proof is then of the raster alone."""
+    known = grid.sigma_m is not None or given.position_sigma is not None
+    if not known and limits.sigma_depth_m == 0 and limits.sigma_position_m == 0:
+        logger.warning(
+            "%s: has no sigma, so the clearance holds over the raster as it stands (k = 0); "
+            "give --map-sigma to cover the map's errors", given.map_path,
+        )  # fmt: skip
+
+
+def from_true_north(
+    limits: VehicleLimits,
+    grid: Grid,
+    start: tuple[float, float] | None,
+    goal: tuple[float, float] | None,
+) -> VehicleLimits:
+    """Return the limits with the headings at the ends, from true north in files, from grid north."""
+    import numpy as np
+
+    from perception.geodesy import convergence
+
+    changed = {}
+    for name, end in (("start_heading_deg", start), ("goal_heading_deg", goal)):
+        value = getattr(limits, name)
+        if math.isfinite(value) and end is not None:
+            turn = convergence(np.array([end[0]]), np.array([end[1]]), grid.crs)
+            changed[name] = value - math.degrees(float(np.nan_to_num(turn)[0]))
+    return replace(limits, **changed)
+
+
+def position_sigma(path: Path | None) -> Callable[[Grid], FloatArray | None]:
+    """Return what gives the expected position error on a grid; None where no file is given."""
+    if path is None:
+        return lambda grid: None
+    import numpy as np
+
+    from mapping.rasters import read_map
+
+    raster = read_map(path)
+
+    def on(grid: Grid) -> FloatArray | None:
+        sampled = raster.sample(*np.meshgrid(*grid.centres()))
+        if not np.isfinite(sampled).any():
+            raise NoOverlapError(f"{path}: does not cover the map; give a raster of the same area")
+        if np.nanmin(sampled) < 0:
+            raise InputError(f"{path}: holds a negative error ({np.nanmin(sampled):g} m)")
+        # Where nothing is known of the position, the worst that is known holds.
+        return np.where(np.isfinite(sampled), sampled, np.nanmax(raster.elevation_m))
+
+    return on
+
+
+def no_go(path: Path | None, crs: str) -> Callable[[Grid], BoolArray | None]:
+    """Return what tells the cells of a grid that no-go areas bar; None where no file is given."""
+    if path is None:
+        return lambda grid: None
+    from mapping.vectors import read_polygons
+    from planning.nogo import forbidden_cells
+
+    polygons = read_polygons(path, crs)
+    return lambda grid: forbidden_cells(grid, polygons)
+
+
+def _weights(grid: Grid, given: Given, reduced: Reduced | None) -> FloatArray | None:
+    if given.region_weights == "none":
+        return None
+    from planning.cost import CLASS_WEIGHTS, read_class_weights, region_weights
+
+    table = dict(CLASS_WEIGHTS)
+    if given.region_weights:
+        table = read_class_weights(Path(given.region_weights))
+    if given.regions is None:
+        from perception.regions import segment
+
+        return region_weights(segment(grid).regions, table)
+    if reduced is not None:
+        from planning.large import reduced_weights
+
+        return reduced_weights(given.regions, reduced, table)
+    from mapping.region_files import read_regions
+
+    regions = read_regions(given.regions)
+    near = 0.01 * grid.cell_m
+    moved = max(
+        abs(regions.west_m - grid.west_m),
+        abs(regions.north_m - grid.north_m),
+        abs(regions.cell_m - grid.cell_m) * grid.shape[1],
+    )
+    if regions.class_code.shape != grid.shape or moved > near:
+        raise InputError(
+            f"{given.regions}: {regions.class_code.shape} cells of {regions.cell_m:g} m from "
+            f"{regions.west_m:.2f},{regions.north_m:.2f} are not the map's {grid.shape} of {grid.cell_m:g} m "
+            f"from {grid.west_m:.2f},{grid.north_m:.2f}; make it from this map: bathynav regions MAP.tif"
+        )
+    return region_weights(regions, table)
