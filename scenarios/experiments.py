@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from perception.files import write_text
-from perception.records import BathynavError, InputError, Progress, silent
+from perception.records import InputError, Progress, silent
+from scenarios.cluster import SchedulerLostError, open_cluster
 from scenarios.outputs import versions
 from scenarios.run_server import RunServer
 from scenarios.sweep import RunSpec, SweepPlan
@@ -32,10 +33,6 @@ _TASKS_PER_WORKER = 4
 # A Dask task costs milliseconds, so short runs share one: as many as take about this long together.
 _BATCH_SECONDS = 0.2
 _LARGEST_BATCH = 32
-
-
-class SchedulerLostError(BathynavError):
-    """The cluster cannot be reached, or went away."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +121,7 @@ def _run_missing(
     done: int,
 ) -> None:
     missing = (spec for spec in plan.runs() if read_record(out, spec.key) is None)
-    with _cluster(scheduler, n_workers) as client:
+    with open_cluster(scheduler, n_workers) as client:
         try:
             for record in _through(client, plan, out, missing):
                 path = record_path(out, record["key"])
@@ -219,30 +216,3 @@ def _execute_one(request: dict[str, Any]) -> dict[str, Any]:
         return _server.run({**request, "folder": folder})
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _cluster(scheduler: str | None, n_workers: int | None) -> Any:
-    """Return a Dask client as a context manager: a cluster's by address, or a local one's."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    logging.getLogger("distributed").setLevel(logging.ERROR)
-    if scheduler is not None:
-        try:
-            return Client(scheduler, timeout="10s", set_as_default=False)
-        except (OSError, ValueError, TimeoutError) as error:
-            raise SchedulerLostError(
-                f"no Dask scheduler answers at {scheduler} ({error}); start one with "
-                "`dask scheduler`, or leave --scheduler out"
-            ) from error
-    # Runs have their own memory limit; Dask's would kill a worker for what its server's child took.
-    dask.config.set({"distributed.worker.memory.terminate": False})
-    cluster = LocalCluster(
-        n_workers=n_workers or os.cpu_count() or 1,
-        threads_per_worker=1,
-        processes=True,
-        memory_limit=0,
-        host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",  # Dask's default binds every interface
-    )
-    return Client(cluster, set_as_default=False)

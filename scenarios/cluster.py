@@ -1,0 +1,52 @@
+"""Dask clusters: a local one whose workers are processes of one thread, or a running one by address."""
+
+from __future__ import annotations
+
+import logging
+import os
+from typing import Any
+
+from perception.records import BathynavError
+
+
+class SchedulerLostError(BathynavError):
+    """The cluster cannot be reached, or went away."""
+
+
+def open_cluster(scheduler: str | None = None, n_workers: int | None = None) -> Any:
+    """Return a Dask client as a context manager: a cluster's by address, or a local one's.
+
+    Parameters
+    ----------
+    scheduler : address of a running scheduler (tcp://HOST:PORT); None starts a local cluster.
+    n_workers : size of the local cluster; None takes one a core.
+
+    Raises
+    ------
+    SchedulerLostError
+        No scheduler answers at the address.
+    """
+    import dask
+    from distributed import Client, LocalCluster
+
+    logging.getLogger("distributed").setLevel(logging.ERROR)
+    if scheduler is not None:
+        try:
+            return Client(scheduler, timeout="10s", set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise SchedulerLostError(
+                f"no Dask scheduler answers at {scheduler} ({error}); start one with "
+                "`dask scheduler`, or leave --scheduler out"
+            ) from error
+    # Runs have their own memory limit; Dask's would kill a worker for what its server's child took.
+    dask.config.set({"distributed.worker.memory.terminate": False})
+    cluster = LocalCluster(
+        n_workers=n_workers or os.cpu_count() or 1,
+        # numba's workqueue layer aborts a process that enters it from two threads.
+        threads_per_worker=1,
+        processes=True,
+        memory_limit=0,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",  # Dask's default binds every interface
+    )
+    return Client(cluster, set_as_default=False)
