@@ -30,21 +30,24 @@ _BLOCK_LINES = 64
 Rows = Callable[[int, int], tuple[FloatArray, FloatArray]]
 
 
+def _unread(first: int, last: int) -> tuple[FloatArray, FloatArray]:
+    raise ValueError("a placed strip was given no rows to read")
+
+
 @dataclass(frozen=True, slots=True)
 class PlacedStrip:
     """One strip at its corrected place.
 
     Attributes
     ----------
-    rows : gives heights and sigma of consecutive lines.
     across_m : (m,) columns, starboard positive.
     easting_m, northing_m, heading_rad : (n,) corrected poses.
     position_m2 : (n,) variance of the horizontal position per axis; 0 unknown.
     reach_m : (n, 2) least and greatest `across_m` with data; NaN none.
     height_m : to be added to the heights; `height_sigma_m` its 1-sigma, common to all cells.
+    rows : gives heights and sigma of consecutive lines.
     """
 
-    rows: Rows
     across_m: FloatArray
     easting_m: FloatArray
     northing_m: FloatArray
@@ -53,6 +56,7 @@ class PlacedStrip:
     reach_m: FloatArray
     height_m: float = 0.0
     height_sigma_m: float = 0.0
+    rows: Rows = _unread
 
     def anchor(self, cell_m: float) -> tuple[int, int]:
         """Return (row, col) of the lattice cell from which this strip's positions are counted."""

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import rasterio
+from pyproj import CRS
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
+from mapping.cog import Statistics
 from perception.files import existing_file, whole_file
 from perception.records import FloatArray, Grid, InputError
 
@@ -131,13 +133,24 @@ class OpenMap:
             north_m=north,
             cell_m=transform.a,
             cell_height_m=None if square else -transform.e,
-            crs=self.source.crs.to_string() if self.source.crs else "",
+            crs=_horizontal(self.source.crs),
             sigma_m=sigma,
             count=None
             if self.count_band is None
             else _read_band(self.source, self.count_band, window),
             datum=self.source.tags().get("VERTICAL_DATUM", ""),
         )
+
+
+def _horizontal(crs: Any) -> str:
+    """Return a raster's CRS without the vertical part that BAG files carry: frames are compared by it."""
+    if not crs:
+        return ""
+    # Compound names are rare, and asking pyproj costs milliseconds.
+    if not crs.to_wkt().startswith("COMPD"):
+        return str(crs.to_string())
+    part = CRS.from_wkt(crs.to_wkt()).sub_crs_list[0]
+    return str(part.to_string())
 
 
 def _main_subdataset(path: Path) -> str:
@@ -306,8 +319,13 @@ def write_bands(
         try:
             with rasterio.open(temporary, "w", **profile) as target:
                 for index, (name, values) in enumerate(bands.items(), start=1):
-                    target.write(np.asarray(values).astype(dtype), index)
+                    band = np.asarray(values).astype(dtype)
+                    target.write(band, index)
                     target.set_band_description(index, name)
+                    if np.issubdtype(band.dtype, np.floating):
+                        statistics = Statistics()
+                        statistics.add(band)
+                        target.update_tags(index, **statistics.tags(rows * cols))
                 target.update_tags(**dict(tags or {}))
         except RasterioError as error:
             raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from error

@@ -236,9 +236,8 @@ def load_plan(path: Path) -> TilePlan:
 def _strip_of(said: dict[str, Any], arrays: dict[str, FloatArray]) -> FiledStrip:
     altitude_m = arrays.pop("altitude_m")
     strip = PlacedStrip(
-        rows=lambda first, last: (np.empty(0), np.empty(0)),
+        *(arrays[name] for name in ("across_m", *_POSES[:4], "reach_m")),
         height_m=said["height_m"],
         height_sigma_m=said["height_sigma_m"],
-        **arrays,
     )
     return filed(StripFile(Path(said["path"]), said["digest"]), strip, altitude_m)

@@ -103,9 +103,8 @@ def _on_cluster(
 
     def submit() -> None:
         for tile, key in waiting:
-            # The key names the task: a tile that is asked for twice is made once.
             future: Future[Tile] = client.submit(
-                work, tile, key, key=f"tile-{tile[0]}-{tile[1]}-{key}", pure=True, retries=2
+                work, tile, key, key=f"tile-{tile[0]}-{tile[1]}-{key}"
             )
             pending.add(future)
             return

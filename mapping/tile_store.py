@@ -53,10 +53,19 @@ class TileStore:
         return cls(folder)
 
     def write(self, where: tuple[slice, slice], layers: Layers | None) -> None:
-        """Write a tile's layers; None empties it."""
-        for name in LAYERS:
-            array: Any = self._group[name]
-            array[where] = array.fill_value if layers is None else layers[name]
+        """Write a tile's layers; None empties it.
+
+        Raises
+        ------
+        InputError
+            The disk is full or may not be written.
+        """
+        try:
+            for name in LAYERS:
+                array: Any = self._group[name]
+                array[where] = array.fill_value if layers is None else layers[name]
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
 
     def read(self, name: str, where: tuple[slice, slice]) -> npt.NDArray[np.float32]:
         """Read part of a layer."""
@@ -129,7 +138,11 @@ def _create(path: Path, plan: TilePlan, frame: list[Any]) -> None:
         crs.attrs.update(CRS.from_user_input(plan.crs).to_cf() if plan.crs else {})
         group.attrs.update({"Conventions": "CF-1.11", "vertical_datum": plan.datum, "frame": frame})
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}); "
-            "give --out a folder that can be written and has room"
-        ) from error
+        raise _unwritable(path, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(
+        f"{path}: cannot be written ({error.strerror or error}); "
+        "give --out a folder that can be written and has room"
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,15 @@ from pyproj import CRS, Transformer
 
 from perception.files import existing_file, whole_file
 from perception.records import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One layer of a vector file: (n,) shapely geometries and an (n,) array for each attribute."""
+
+    geometries: Sequence[Any] | npt.NDArray[Any]
+    columns: Mapping[str, npt.NDArray[Any]]
+    geometry_type: str
 
 
 def write_layer(
@@ -32,24 +42,30 @@ def write_layer(
     columns : attribute to (n,) array.
     geometry_type : "Point", "LineString", "Polygon", "MultiPolygon", with " Z" or "3D " as OGR has it.
     """
-    shapes = np.asarray(geometries, dtype=object)
-    target_crs = crs
-    if path.suffix == ".geojson" and crs:
-        # RFC 7946 knows WGS 84 only.
-        shapes, target_crs = to_lonlat(shapes, crs), "EPSG:4326"
+    write_layers(path, {layer or path.stem: Layer(geometries, columns, geometry_type)}, crs)
+
+
+def write_layers(path: Path, layers: Mapping[str, Layer], crs: str) -> None:
+    """Write the named layers into one file, whole or not at all; only GPKG holds more than one."""
     driver = {".gpkg": "GPKG", ".geojson": "GeoJSON"}[path.suffix]
     with whole_file(path) as temporary:
         try:
-            pyogrio.raw.write(
-                temporary,
-                shapely.to_wkb(shapes),
-                field_data=[np.asarray(v) for v in columns.values()],
-                fields=list(columns),
-                crs=target_crs or None,
-                geometry_type=geometry_type,
-                driver=driver,
-                layer=layer or path.stem,
-            )
+            for number, (name, layer) in enumerate(layers.items()):
+                shapes, target_crs = np.asarray(layer.geometries, dtype=object), crs
+                if driver == "GeoJSON" and crs:
+                    # RFC 7946 knows WGS 84 only.
+                    shapes, target_crs = to_lonlat(shapes, crs), "EPSG:4326"
+                pyogrio.raw.write(
+                    temporary,
+                    shapely.to_wkb(shapes),
+                    field_data=[np.asarray(v) for v in layer.columns.values()],
+                    fields=list(layer.columns),
+                    crs=target_crs or None,
+                    geometry_type=layer.geometry_type,
+                    driver=driver,
+                    layer=name,
+                    append=number > 0,
+                )
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
             raise InputError(f"{path}: cannot be written ({error})") from error
 

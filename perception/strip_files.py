@@ -30,7 +30,10 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "heading_rad": (("line",), "rad", "heading, clockwise from grid north", ""),
     "altitude_m": (("line",), "m", "height of the sonar above the sea floor", "height_above_sea_floor"),
     "altitude_sigma_m": (("line",), "m", "1-sigma of altitude", ""),
+    "lead_m": (("line",), "m", "how far ahead of the sonar the line lies", ""),
 }  # fmt: skip
+# Variables that a strip may lack.
+_OPTIONAL = ("lead_m",)
 
 
 def strip_dataset(strip: ElevationStrip, utc: bool = True) -> xarray.Dataset:
@@ -39,6 +42,8 @@ def strip_dataset(strip: ElevationStrip, utc: bool = True) -> xarray.Dataset:
 
     variables = {}
     for name, (dimensions, units, long_name, standard) in _VARIABLES.items():
+        if getattr(strip, name) is None:
+            continue
         values = np.asarray(getattr(strip, name))
         if name == "shadow":
             values = values.astype(np.int8)
@@ -90,12 +95,12 @@ def read_strip(path: Path) -> ElevationStrip:
     path = existing_file(path)
     try:
         with xarray.open_dataset(path, engine="netcdf4", decode_times=False) as data:
-            missing = [name for name in _VARIABLES if name not in data]
+            missing = [name for name in _VARIABLES if name not in data and name not in _OPTIONAL]
             if missing:
                 raise InputError(
                     f"{path}: lacks {missing[0]}; give a strip written by `bathynav strips`"
                 )
-            values = {name: data[name].to_numpy() for name in _VARIABLES}
+            values = {name: data[name].to_numpy() for name in _VARIABLES if name in data}
             attributes = dict(data.attrs)
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):

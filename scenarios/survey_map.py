@@ -5,6 +5,7 @@ Each function is one stage; the arithmetic lives in `perception` and `mapping`.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -183,7 +184,7 @@ def build_passes(
     InputError
         No pass gives a strip; single ones that do not are left out with a warning.
     """
-    key = (*_identity(survey), config)
+    key = (*identity(survey), config)
     if tell is None and key in _recent:
         return _recent[key]
     results: list[PassSummary] = []
@@ -207,11 +208,11 @@ def build_passes(
     return _recent[key]
 
 
-def _identity(survey: Survey) -> tuple[object, ...]:
+def identity(survey: Survey) -> tuple[object, ...]:
     """Return what makes two openings of a survey the same: its files as they are, its frame, its poses."""
     files = tuple((str(f.path.resolve()), *_stamp(f.path)) for f in survey.files)
     headers = tuple(
-        hash(np.ascontiguousarray(getattr(survey.pings, f.name)).tobytes())
+        hashlib.blake2b(np.ascontiguousarray(getattr(survey.pings, f.name)).tobytes()).hexdigest()
         for f in fields(survey.pings)
     )
     return (*files, survey.crs, *headers)

@@ -1,0 +1,149 @@
+"""Cloud-optimised GeoTIFFs written window by window: rasters larger than memory, with overviews."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rasterio
+import rasterio.shutil
+from rasterio.errors import RasterioError
+from rasterio.transform import Affine
+from rasterio.windows import Window
+
+from perception.files import whole_file
+from perception.records import Grid, InputError, Progress, silent
+
+# What GDAL may keep of rasters in memory, MB; its own default is a twentieth of the machine's.
+_CACHE_MB = 256
+
+Slices = tuple[slice, slice]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Where a raster lies: outer edges, cell, size; rows run north to south."""
+
+    west_m: float
+    north_m: float
+    cell_m: float
+    shape: tuple[int, int]
+    crs: str = ""
+    datum: str = ""
+    cell_north_m: float | None = None
+
+    @classmethod
+    def of(cls, grid: Grid) -> Frame:
+        """Return a grid's frame."""
+        return cls(grid.west_m, grid.north_m, grid.cell_m, grid.shape, grid.crs, grid.datum,
+                   grid.cell_north_m)  # fmt: skip
+
+    @property
+    def transform(self) -> Affine:
+        north = self.cell_m if self.cell_north_m is None else self.cell_north_m
+        return Affine(self.cell_m, 0, self.west_m, 0, -north, self.north_m)
+
+
+class Statistics:
+    """Running statistics of one band, NaN left out, in the tags by which GDAL keeps them."""
+
+    def __init__(self) -> None:
+        self.number, self.mean, self.square = 0, 0.0, 0.0
+        self.low, self.high = np.inf, -np.inf
+
+    def add(self, values: npt.NDArray[Any]) -> None:
+        """Take in the values of a window (Chan's parallel update of mean and variance)."""
+        known = np.asarray(values[np.isfinite(values)], float)
+        if not known.size:
+            return
+        mean, square = float(known.mean()), float(((known - known.mean()) ** 2).sum())
+        total = self.number + known.size
+        apart = mean - self.mean
+        self.square += square + apart**2 * self.number * known.size / total
+        self.mean += apart * known.size / total
+        self.number = total
+        self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
+
+    def tags(self, cells: int) -> dict[str, str]:
+        """Return GDAL's tags; none where no value was seen."""
+        if not self.number:
+            return {}
+        return {
+            "STATISTICS_MINIMUM": repr(self.low),
+            "STATISTICS_MAXIMUM": repr(self.high),
+            "STATISTICS_MEAN": repr(self.mean),
+            "STATISTICS_STDDEV": repr(float(np.sqrt(self.square / self.number))),
+            "STATISTICS_VALID_PERCENT": f"{100 * self.number / cells:.4g}",
+        }
+
+
+def write_cog(
+    path: Path,
+    frame: Frame,
+    bands: Sequence[str],
+    windows: Iterable[tuple[Slices, Mapping[str, npt.NDArray[Any]]]],
+    tags: Mapping[str, str] | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Write described float32 bands, NaN nodata, with averaged overviews and statistics.
+
+    A plain tiled GeoTIFF beside it takes the windows in any order; GDAL then orders tiles and overviews as
+    a COG wants them, block by block. Memory stays at a window and GDAL's cache, whatever the size.
+
+    Parameters
+    ----------
+    windows : slices of the raster (rows from the north) with the values of every band; what no window covers is
+        NaN.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written; nothing is left behind.
+    """
+    rows, cols = frame.shape
+    profile = {
+        "driver": "GTiff", "dtype": "float32", "count": len(bands), "height": rows, "width": cols,
+        "crs": frame.crs or None, "transform": frame.transform, "nodata": float("nan"),
+        "tiled": True, "blockxsize": 512, "blockysize": 512, "interleave": "band",
+        "sparse_ok": True, "bigtiff": "if_safer",
+    }  # fmt: skip
+    draft = path.with_name(f".{path.stem}.{os.getpid()}.draft.tif")
+    try:
+        with whole_file(path) as temporary, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
+            with rasterio.open(draft, "w", **profile) as target:
+                said = _fill(target, bands, windows)
+                for index, (name, statistics) in enumerate(said.items(), start=1):
+                    target.set_band_description(index, name)
+                    target.update_tags(index, **statistics.tags(rows * cols))
+                datum = {"VERTICAL_DATUM": frame.datum} if frame.datum else {}
+                target.update_tags(**datum, **dict(tags or {}))
+            progress("writing the raster", 0, 1)
+            rasterio.shutil.copy(
+                draft, temporary, driver="COG", compress="deflate", predictor="yes", level="4",
+                overview_resampling="average", bigtiff="if_safer", num_threads="2",
+            )  # fmt: skip
+            progress("writing the raster", 1, 1)
+    except RasterioError as error:
+        raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from error
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _fill(
+    target: Any,
+    bands: Sequence[str],
+    windows: Iterable[tuple[Slices, Mapping[str, npt.NDArray[Any]]]],
+) -> dict[str, Statistics]:
+    said = {name: Statistics() for name in bands}
+    for (rows, cols), values in windows:
+        window = Window(cols.start, rows.start, cols.stop - cols.start, rows.stop - rows.start)
+        for index, name in enumerate(bands, start=1):
+            band = np.asarray(values[name], np.float32)
+            target.write(band, index, window=window)
+            said[name].add(band)
+    return said

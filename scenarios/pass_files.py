@@ -1,0 +1,131 @@
+"""Passes on disk: strips made one at a time, kept as files, taken up again by a later run.
+
+Of a pass that is filed only what registration needs stays in memory: the strip on coarse columns, the reach of
+its heights, its objects.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapping.placed import reach_of
+from mapping.textures import default_cell, thinned
+from mapping.tile_plan import StripFile
+from perception.files import whole_file, write_text
+from perception.objects import ObjectTable
+from perception.readers import Survey
+from perception.records import ElevationStrip, FloatArray, InputError, Progress, silent
+from perception.strip_files import read_strip, write_strip
+from perception.strips import StripConfig, build_strip
+
+logger = logging.getLogger(__name__)
+
+# Registration compares strips on this part of its cell; finer columns stay on disk.
+_THIN = 0.6
+
+
+@dataclass(frozen=True, slots=True)
+class FiledPass:
+    """One pass whose strip lies in a file.
+
+    Attributes
+    ----------
+    file : the whole strip.
+    thin : the strip on columns wide enough for registration.
+    across_m : (m,) columns of the whole strip; reach_m : (n, 2) its least and greatest with a height.
+    cell_m : cell on which registration compares it.
+    """
+
+    file: StripFile
+    thin: ElevationStrip
+    across_m: FloatArray
+    reach_m: FloatArray
+    objects: ObjectTable
+    cell_m: float
+
+
+def file_passes(
+    survey: Survey,
+    folder: Path,
+    identity: tuple[object, ...],
+    config: StripConfig | None = None,
+    progress: Progress = silent,
+) -> list[FiledPass]:
+    """Turn every pass into a strip file in `folder`, one pass in memory at a time.
+
+    Parameters
+    ----------
+    identity : what tells this survey from another; a pass that was filed under it is not made again.
+
+    Raises
+    ------
+    InputError
+        No pass gives a strip; single ones that do not are left out with a warning.
+    """
+    filed_passes: list[FiledPass] = []
+    refused: list[str] = []
+    for index in range(survey.n_passes):
+        progress("echoes to strips", index, survey.n_passes)
+        key = hashlib.blake2b(repr((identity, config, index)).encode(), digest_size=16).hexdigest()
+        path = folder / f"strip-{index:03d}.nc"
+        try:
+            filed_passes.append(_taken_up(path, key) or _made(survey, index, path, key, config))
+        except InputError as error:
+            refused.append(str(error))
+            logger.warning("%s; left out", error)
+    progress("echoes to strips", survey.n_passes, survey.n_passes)
+    if not filed_passes:
+        raise InputError(refused[0] if refused else "the survey holds no pass to make a strip of")
+    return filed_passes
+
+
+def _made(
+    survey: Survey, index: int, path: Path, key: str, config: StripConfig | None
+) -> FiledPass:
+    result = build_strip(survey.swath(index), config)
+    write_strip(path, result.strip, survey.utc)
+    _write_objects(path.with_suffix(".objects.npz"), result.objects)
+    file = StripFile.of(path)
+    write_text(path.with_suffix(".json"), json.dumps({"key": key, "digest": file.digest}) + "\n")
+    return _filed(file, result.strip, result.objects)
+
+
+def _taken_up(path: Path, key: str) -> FiledPass | None:
+    """Return a pass that was filed under this key; None where it is not there whole."""
+    try:
+        said = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+        if said["key"] != key or StripFile.of(path).digest != said["digest"]:
+            return None
+        objects = _read_objects(path.with_suffix(".objects.npz"))
+    except (OSError, ValueError, KeyError):
+        return None
+    return _filed(StripFile(path, said["digest"]), read_strip(path), objects)
+
+
+def _filed(file: StripFile, strip: ElevationStrip, objects: ObjectTable) -> FiledPass:
+    cell_m = default_cell([strip])
+    across_m = np.asarray(strip.across_m, float)
+    return FiledPass(
+        file, thinned(strip, _THIN * cell_m), across_m, reach_of(strip), objects, cell_m
+    )
+
+
+def _write_objects(path: Path, table: ObjectTable) -> None:
+    columns: dict[str, Any] = {f.name: np.asarray(getattr(table, f.name)) for f in fields(table)}
+    columns["kind"] = np.array(table.kind, dtype="U16")
+    with whole_file(path) as temporary:
+        np.savez(temporary, **columns)
+
+
+def _read_objects(path: Path) -> ObjectTable:
+    with np.load(path, allow_pickle=False) as data:
+        columns: dict[str, Any] = {f.name: data[f.name] for f in fields(ObjectTable)}
+    columns["kind"] = tuple(str(kind) for kind in columns["kind"])
+    return ObjectTable(**columns)

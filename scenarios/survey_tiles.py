@@ -1,0 +1,172 @@
+"""Sonar files to one map that may outgrow memory: strips on disk, then tiles.
+
+    passes one at a time -> strip files; coarse strips -> registration and graph -> poses
+    strip files at corrected poses -> tiles in a Zarr store, on Dask
+
+docs/any-size.md has the flow, what it costs and where its limits lie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapping.fixes import PositionFix
+from mapping.fusion import default_cell
+from mapping.placed import PlacedStrip, position_variance
+from mapping.survey import CorrectedSurvey, SurveyConfig, correct_survey
+from mapping.textures import MatchConfig
+from mapping.tile_figures import map_figures
+from mapping.tile_plan import TILE_CELLS, TilePlan, filed, plan_tiles
+from mapping.tile_run import fuse_tiles
+from mapping.tile_store import TileStore
+from perception.objects import ObjectTable
+from perception.readers import Survey
+from perception.records import ElevationStrip, Grid, Progress, Trajectory, silent
+from scenarios.cluster import open_cluster
+from scenarios.pass_files import FiledPass, file_passes
+from scenarios.survey_map import corrected_objects, identity, navigated_track, whole_track
+
+# A map of more cells than this is made in tiles without being asked: in one piece it would take some
+# hundred bytes a cell and pass, several GB.
+MOST_CELLS_AT_ONCE = 25_000_000
+# Pictures and a prior map's tie look at every so manieth cell, this many at most.
+_PICTURE_CELLS = 4_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class TiledSurvey:
+    """What a survey became, its map in a store.
+
+    Attributes
+    ----------
+    plan, store : the tiles; `figures` of the whole map, `made` tiles that this run made.
+    track, raw_track, corrected, objects : as in `SurveyMap`; the strips of `corrected` are coarse.
+    """
+
+    plan: TilePlan
+    store: TileStore
+    figures: dict[str, Any]
+    made: int
+    track: Trajectory
+    raw_track: Trajectory
+    corrected: CorrectedSurvey
+    objects: tuple[ObjectTable, ...]
+
+    @property
+    def strips(self) -> tuple[ElevationStrip, ...]:
+        return self.corrected.strips
+
+    def overview(self, name: str = "elevation") -> Grid:
+        """Return every k-th cell of a layer, few enough for a picture, with sigma where it is heights."""
+        rows, cols = self.plan.shape
+        step = max(1, int(np.ceil(np.sqrt(rows * cols / _PICTURE_CELLS))))
+        layers = {name: _thin(self.plan, self.store, name, step)}
+        if name == "elevation":
+            layers["sigma"] = _thin(self.plan, self.store, "sigma", step)
+        return Grid(
+            layers[name].astype(float), self.plan.west_m, self.plan.north_m, step * self.plan.cell_m,
+            self.plan.crs, layers.get("sigma"), datum=self.plan.datum,
+        )  # fmt: skip
+
+
+def _thin(plan: TilePlan, store: TileStore, name: str, step: int) -> np.ndarray:
+    """Return every `step`-th cell, read a row of tiles at a time."""
+    parts = []
+    for top in range(0, plan.shape[0], plan.tile_cells):
+        first = -(-top // step) * step
+        rows = slice(top, min(top + plan.tile_cells, plan.shape[0]))
+        part = store.read(name, (rows, slice(0, plan.shape[1])))
+        parts.append(part[first - top :: step, ::step])
+    return np.concatenate(parts)
+
+
+def map_tiles(
+    survey: Survey,
+    folder: Path,
+    *,
+    fixes: Sequence[PositionFix] = (),
+    cell_m: float | None = None,
+    tile_cells: int = TILE_CELLS,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    progress: Progress = silent,
+) -> TiledSurvey:
+    """Turn the passes of a survey into a map in tiles, in bounded memory.
+
+    Parameters
+    ----------
+    folder : where strips and tiles are kept; a later call with the same survey and settings goes on there.
+    scheduler : address of a Dask cluster that sees `folder`; None starts a local one of `workers`.
+    """
+    passes = file_passes(survey, folder / "strips", identity(survey), progress=progress)
+    thin = [one.thin for one in passes]
+    config = SurveyConfig(
+        match=MatchConfig(cell_m=float(np.median([one.cell_m for one in passes])))
+    )
+    corrected = correct_survey(thin, fixes, config, progress=progress)
+    track = whole_track(survey, corrected.trajectory)
+    cell = cell_m or default_cell([_columns(one) for one in passes])
+    strips = [
+        filed(one.file, _placed(one, corrected, index), one.thin.altitude_m)
+        for index, one in enumerate(passes)
+    ]
+    plan = plan_tiles(strips, cell, survey.crs, survey.datum, tile_cells)
+    with open_cluster(scheduler, workers) as client:
+        store, tiles, made = fuse_tiles(plan, folder, client, progress)
+    raw = navigated_track(survey)
+    return TiledSurvey(
+        plan=plan,
+        store=store,
+        figures=map_figures(tiles, plan.shape[0] * plan.shape[1], cell),
+        made=made,
+        track=track,
+        raw_track=raw,
+        corrected=corrected,
+        objects=tuple(corrected_objects(one.objects, raw, track) for one in passes),
+    )
+
+
+def _columns(one: FiledPass) -> ElevationStrip:
+    """Return a strip of two columns as far apart as the whole strip's: all that a cell's choice asks of it."""
+    step = float(np.median(np.diff(one.across_m))) if len(one.across_m) > 1 else 1.0
+    two = np.zeros((len(one.thin.time_s), 2), np.float32)
+    return replace(
+        one.thin,
+        elevation_m=two,
+        sigma_m=two,
+        echo=two,
+        shadow=two > 0,
+        across_m=np.array([0, step]),
+    )
+
+
+def _placed(one: FiledPass, corrected: CorrectedSurvey, index: int) -> PlacedStrip:
+    strip = corrected.strips[index]
+    return PlacedStrip(
+        across_m=one.across_m,
+        easting_m=strip.easting_m,
+        northing_m=strip.northing_m,
+        heading_rad=strip.heading_rad,
+        position_m2=position_variance(strip.ping, corrected.trajectory),
+        reach_m=one.reach_m,
+        height_m=float(corrected.height_m[index]),
+        height_sigma_m=float(corrected.height_sigma_m[index]),
+    )
+
+
+def expected_cells(survey: Survey, cell_m: float | None) -> int:
+    """Return about how many cells a survey's map will have, from the pings' headers alone."""
+    pings = survey.pings
+    used = pings.pass_index >= 0
+    reach_m = float(np.median((pings.sample_m * pings.samples)[used]))
+    size = [float(np.ptp(v[used])) + 2 * reach_m for v in (pings.easting_m, pings.northing_m)]
+    if cell_m is None:
+        step = np.hypot(np.diff(pings.easting_m[used]), np.diff(pings.northing_m[used]))
+        columns = max(2 * float(np.median(pings.sample_m[used])), reach_m / 500)
+        cell_m = max(float(np.median(step)), columns)
+    return int(size[0] * size[1] / cell_m**2)
