@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,10 @@ import pytest
 import shapely
 from click.testing import CliRunner
 
-from mapping.rasters import write_map
+from mapping.rasters import write_bands, write_map
 from mapping.vectors import write_layer
-from perception.records import NoPathError
+from perception.geodesy import convergence
+from perception.records import Grid, NoPathError
 from scenarios.commands.plan import command
 from tests.planning.terrains import NORTH, WEST, canyon, flat, grid_of
 
@@ -177,3 +180,200 @@ def test_a_vehicle_file_with_a_slip_names_the_key(chart, tmp_path):
     limits.write_text("[vehicle]\nturn_radius = 12\n")
     result = plan(chart, tmp_path / "o", "--vehicle", limits)
     assert "unknown key 'turn_radius'" in str(result.exception)
+
+
+# ---- maps too large to hold --------------------------------------------------------------------
+
+
+def rough_ground(n: int = 400) -> np.ndarray:
+    row, col = np.mgrid[:n, :n]
+    return -60.0 + 5.0 * np.sin(row / 60.0) * np.cos(col / 50.0) + 0.3 * np.sin(row * 1.7 + col)
+
+
+@pytest.fixture
+def small_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a map of 160,000 cells too large to hold."""
+    monkeypatch.setattr("planning.large.MOST_CELLS", 10_000)
+    monkeypatch.setattr("planning.large.REDUCED_CELLS", 10_000)
+    monkeypatch.setattr("planning.full_resolution._WINDOW_CELLS", 64.0)
+    monkeypatch.setattr("planning.full_resolution._REPAIR_CELLS", 100.0)
+
+
+def large_plan(path: Path, out: Path, *more: object) -> dict:
+    weights = () if "--regions" in more else ("--region-weights", "none")
+    result = run(
+        "--map", path, "--start", position(20.2, 30), "--goal", position(380, 361.3), "--out", out,
+        *weights, "--planner", "none", "--no-picture", *more,
+    )  # fmt: skip
+    assert result.exception is None, result.exception
+    return json.loads((out / "metrics.json").read_text())
+
+
+def least_altitude(out: Path, z: np.ndarray) -> float:
+    """Sample a written route densely over the heights as stored."""
+    with (out / "route.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    e, n, d = (np.array([float(r[c]) for r in rows]) for c in COLUMNS[:3])
+    v = np.linspace(0, 1, 21)
+    e, n, d = ((a[:-1, None] + np.diff(a)[:, None] * v).ravel() for a in (e, n, d))
+    return float(np.min(-d - grid_of(z.astype(np.float32)).sample(e, n)))
+
+
+def test_a_large_map_takes_its_sigma_from_the_option_and_its_heights_from_a_depth_band(
+    tmp_path, small_memory
+):
+    z = rough_ground()
+    frame = grid_of(z)
+    write_bands(tmp_path / "m.tif", {"uncertainty": np.full(z.shape, 0.1), "depth": -z}, frame)
+    banded = large_plan(tmp_path / "m.tif", tmp_path / "a")
+    given = large_plan(tmp_path / "m.tif", tmp_path / "b", "--map-sigma", 0.4)
+    assert banded["k_sigma"] > 3 and given["k_sigma"] > 3
+    for metrics, sigma, out in ((banded, 0.1, "a"), (given, 0.4, "b")):
+        least = least_altitude(tmp_path / out, z)
+        assert least >= 5.0 + sigma * metrics["k_sigma"] - 1e-3
+        assert least <= 5.1 + sigma * metrics["k_sigma"]
+
+
+def test_a_boulder_and_a_hole_that_block_means_hide_are_gone_round_at_full_resolution(
+    tmp_path, small_memory
+):
+    z = rough_ground()
+    write_map(tmp_path / "plain.tif", grid_of(z))
+    large_plan(tmp_path / "plain.tif", tmp_path / "plain")
+    with (tmp_path / "plain" / "route.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    middle = rows[len(rows) // 2]
+    row, col = grid_of(z).fractional_index(
+        *(np.array(float(middle[name])) for name in ("easting_m", "northing_m"))
+    )
+    row, col = round(float(row)), round(float(col))
+    # A spire of one cell, too steep to fly over within the ceiling, right below the route.
+    spired = z.copy()
+    block = np.s_[row // 4 * 4 : row // 4 * 4 + 4, col // 4 * 4 : col // 4 * 4 + 4]
+    # The block's mean tells nothing: the rest of it is as much lower.
+    spired[block] -= (-32.0 - z[row, col]) / 15.0
+    spired[row, col] = -32.0
+    write_map(tmp_path / "spire.tif", grid_of(spired))
+    metrics = large_plan(tmp_path / "spire.tif", tmp_path / "spire")
+    assert metrics["stretches_replanned"] >= 1
+    assert least_altitude(tmp_path / "spire", spired) >= 5.0
+    # A row of specks without data, one in every block across the way: two metres are left between them.
+    holed = z.copy()
+    holed[200, ::4] = np.nan
+    write_map(tmp_path / "holed.tif", grid_of(holed))
+    large_plan(tmp_path / "holed.tif", tmp_path / "holed")
+    assert least_altitude(tmp_path / "holed", holed) >= 5.0
+
+
+def test_a_large_map_takes_regions_of_its_own_grid_and_refuses_others(tmp_path, small_memory):
+    z = rough_ground()
+    frame = grid_of(z)
+    write_map(tmp_path / "map.tif", frame)
+    code = np.full(z.shape, 4)
+    code[:, 150:250] = 1
+    bands = {"class": code, "region": np.ones_like(code)}
+    write_bands(tmp_path / "regions.tif", bands, frame, dtype="int32", nodata=0)
+    metrics = large_plan(
+        tmp_path / "map.tif", tmp_path / "a", "--regions", tmp_path / "regions.tif"
+    )
+    # A peak costs 2, a valley 1; a hundred columns of peak must be crossed.
+    assert metrics["cost"] > metrics["length_m"] + 95
+    moved = replace(frame, west_m=frame.west_m + 7.0)
+    write_bands(tmp_path / "regions.tif", bands, moved, dtype="int32", nodata=0)
+    result = run(
+        "--map", tmp_path / "map.tif", "--start", position(20.2, 30), "--goal", position(380, 361.3),
+        "--out", tmp_path / "b", "--regions", tmp_path / "regions.tif",
+    )  # fmt: skip
+    assert "are not the map's" in str(result.exception)
+
+
+def test_no_go_areas_of_a_large_map_hold_at_full_resolution(tmp_path, small_memory):
+    z = rough_ground()
+    write_map(tmp_path / "map.tif", grid_of(z))
+    area = shapely.box(WEST + 180, NORTH - 260, WEST + 181.5, NORTH - 140)
+    write_layer(tmp_path / "no.gpkg", [area], {"id": np.array([1])}, "EPSG:32632", "Polygon")
+    large_plan(tmp_path / "map.tif", tmp_path / "a", "--avoid", tmp_path / "no.gpkg")
+    with (tmp_path / "a" / "route.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    line = shapely.linestrings([(float(r["easting_m"]), float(r["northing_m"])) for r in rows])
+    assert not shapely.intersects(line, area)
+
+
+def test_regions_of_another_place_are_refused(chart, tmp_path):
+    frame = grid_of(np.zeros((160, 160)))
+    moved = replace(frame, north_m=frame.north_m + 30.0)
+    bands = {"class": np.ones((160, 160)), "region": np.ones((160, 160))}
+    write_bands(tmp_path / "regions.tif", bands, moved, dtype="int32", nodata=0)
+    result = run(
+        "--map", chart, "--start", position(6, 80), "--goal", position(150, 80),
+        "--out", tmp_path / "o", "--regions", tmp_path / "regions.tif",
+    )  # fmt: skip
+    assert "are not the map's" in str(result.exception)
+
+
+# ---- headings, missions, currents --------------------------------------------------------------
+
+
+def test_headings_in_files_are_from_true_north(tmp_path):
+    # Three degrees east of the zone's central meridian the grid is turned by 1.8 deg and more.
+    east = 750_000.0
+    grid = Grid(flat(), east, 4_500_000.0, 1.0, crs="EPSG:32632")
+    write_map(tmp_path / "map.tif", grid)
+    turn = math.degrees(float(convergence(np.array([east]), np.array([4_500_000.0]), grid.crs)[0]))
+    assert turn > 1.8
+    result = run(
+        "--map", tmp_path / "map.tif", "--start", f"{east + 60},{4_500_000 - 110}",
+        "--goal", f"{east + 60},{4_500_000 - 10}", "--out", tmp_path / "o",
+        "--region-weights", "none", "--planner", "none", "--no-picture",
+    )  # fmt: skip
+    assert result.exception is None, result.exception
+    with (tmp_path / "o" / "route.csv").open() as stream:
+        heading = np.array([float(r["heading_deg"]) for r in csv.DictReader(stream)])
+    # Straight to grid north, but for what a polished polygon wriggles.
+    np.testing.assert_allclose(heading.mean(), turn, atol=0.05)
+    np.testing.assert_allclose(heading, turn, atol=0.5)
+    # A heading asked for is from true north too: this one is grid north, so nothing bends.
+    (tmp_path / "v.toml").write_text(f"[vehicle]\nstart_heading_deg = {turn}\n")
+    result = run(
+        "--map", tmp_path / "map.tif", "--start", f"{east + 60},{4_500_000 - 110}",
+        "--goal", f"{east + 60},{4_500_000 - 10}", "--out", tmp_path / "o", "--vehicle",
+        tmp_path / "v.toml", "--region-weights", "none", "--planner", "none", "--no-picture",
+    )  # fmt: skip
+    assert result.exception is None, result.exception
+    metrics = json.loads((tmp_path / "o" / "metrics.json").read_text())
+    assert abs(metrics["length_m"] - 100.0) < 0.01
+
+
+def test_a_mission_keeps_metrics_flat_and_tells_the_order(chart, tmp_path):
+    result = plan(
+        chart, tmp_path, "--via", position(110, 80), "--via", position(50, 80),
+    )  # fmt: skip
+    assert result.exception is None, result.exception
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["order"] == "0 2 1 3" and metrics["stops"] == 4
+    assert not [k for k, v in metrics.items() if isinstance(v, list)]
+
+
+def test_a_current_lengthens_the_way_against_it_and_shortens_the_way_with_it(tmp_path):
+    write_map(tmp_path / "map.tif", grid_of(flat()))
+    times = {}
+    for name, current in (("still", None), ("against", "0,-0.5"), ("with", "0,0.5")):
+        more = () if current is None else ("--currents", current)
+        result = run(
+            "--map", tmp_path / "map.tif", "--start", position(110, 60), "--goal", position(10, 60),
+            "--out", tmp_path / name, "--region-weights", "none", "--planner", "none", "--no-picture",
+            *more,
+        )  # fmt: skip
+        assert result.exception is None, result.exception
+        times[name] = json.loads((tmp_path / name / "metrics.json").read_text())["travel_time_s"]
+    np.testing.assert_allclose(times["still"], 100 / 1.5, rtol=1e-3)
+    np.testing.assert_allclose(times["against"], 100 / 1.0, rtol=1e-2)
+    np.testing.assert_allclose(times["with"], 100 / 2.0, rtol=1e-2)
+
+
+def test_a_map_without_sigma_is_told_to_hold_as_it_stands(chart, tmp_path, caplog):
+    assert plan(chart, tmp_path).exception is None
+    assert "has no sigma" in caplog.text and "--map-sigma" in caplog.text
+    caplog.clear()
+    assert plan(chart, tmp_path, "--map-sigma", 0.2, "--risk", 0.1).exception is None
+    assert "has no sigma" not in caplog.text
