@@ -59,6 +59,9 @@ class BottomTrack:
 _COARSE_CELLS = 400
 # Score of one cell is limited, so that one bright fish or one dark cell cannot outvote its neighbours.
 _CELL_LIMIT = 3.0
+# Echoes weaker than the floor's by more than this (log power, 30 dB) count as water: side lobes hear the
+# neighbouring pings' nearer floor before their own, far above the noise and far below the floor.
+_FAINT = 6.9
 # Stretch after the edge that must look like floor, as a part of the range.
 _AFTER = 0.5
 
@@ -186,7 +189,7 @@ def _levels(
     floor = np.maximum(floor, water + 0.5)
     residual = np.abs(image - np.where(in_floor, floor, water))[in_water | in_floor]
     spread = 1.48 * float(np.median(residual)) if len(residual) else 1.0
-    return water, floor, max(spread, 0.2)
+    return np.maximum(water, floor - _FAINT), floor, max(spread, 0.2)
 
 
 def _filled(values: FloatArray, fallback: float) -> FloatArray:
@@ -296,6 +299,7 @@ def _refine(
     low = np.median(band[:, : half // 2 + 1])
     high = np.median(band[:, half + 1 : half + 1 + max(3, half // 2)])
     spread = max(1.48 * float(np.median(np.abs(band[:, half + 1 :] - high))), 0.3)
+    low = max(low, high - _FAINT)
     if high - low < 0.3:
         high = low + 0.3
     ratio = np.clip((high - low) * (band - (high + low) / 2) / spread**2, -3, 3)
