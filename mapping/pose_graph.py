@@ -40,6 +40,8 @@ class GraphConfig:
     sonar_heading_deg : 1-sigma of the difference between the sonar's heading error and the course error.
     start_m : 1-sigma of the navigation's start where no fix is given (a GPS fix before the dive).
     start_with_fixes_m : the same where fixes are given, which then decide.
+    shared : correlation of these errors from pass to pass of a dive: 0 each its own, near 1 one
+        instrument's constant. `mapping.sharing` chooses it by what the survey says.
     height_m : 1-sigma of a strip's height offset (depth sensor, tide left over).
     outlier_probability : chance of refusing a good registration (chi-square tail of the GNC threshold).
     """
@@ -48,6 +50,7 @@ class GraphConfig:
     heading_bias_deg: float = 0.5
     scale: float = 0.005
     sonar_heading_deg: float = 0.3
+    shared: float = 0.0
     start_m: float = 2.0
     start_with_fixes_m: float = 300.0
     height_m: float = 0.3
@@ -64,7 +67,6 @@ class Link:
     first_offset_m, second_offset_m : (2,) from each keyframe to the matched ground.
     shift_m : (2,) correction of the ground of `second` minus that of `first`.
     covariance_m2 : (2, 2) of `shift_m`.
-    height_m, height_sigma_m : height correction of second minus first; NaN unknown.
     """
 
     first: int
@@ -73,8 +75,16 @@ class Link:
     second_offset_m: FloatArray
     shift_m: FloatArray
     covariance_m2: FloatArray
-    height_m: float = float("nan")
-    height_sigma_m: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class HeightStep:
+    """Height correction of strip `second` minus that of strip `first`, with its 1-sigma."""
+
+    first: int
+    second: int
+    height_m: float
+    sigma_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +96,9 @@ class Solution:
     correction_m : (k, 2) to be added to the keyframes' positions; `covariance_m2` (k, 2, 2).
     pass_errors : (p, 3) scale, course bias, sonar heading bias (rad) of each strip; `pass_sigma` alike.
     height_m, height_sigma_m : (p,) to be added to each strip's heights.
-    link_used, fix_used : which were found consistent.
+    link_used, fix_used, step_used : which were found consistent.
+    log_evidence : logarithm of the probability of what was used under the graph's assumptions, up to a
+        constant of the data; NaN where it cannot be had.
     error_before, error_after : the graph's error (half a chi-square) over what was used.
     indeterminate, worsened : the graph does not determine the answer; the answer is no better.
     """
@@ -99,6 +111,8 @@ class Solution:
     height_sigma_m: FloatArray
     link_used: BoolArray
     fix_used: BoolArray
+    step_used: BoolArray
+    log_evidence: float
     error_before: float
     error_after: float
     indeterminate: bool
@@ -116,6 +130,7 @@ def solve(
     fixes: Sequence[KeyframeFix] = (),
     config: GraphConfig | None = None,
     robust: bool = True,
+    steps: Sequence[HeightStep] = (),
 ) -> Solution:
     """Solve the survey's graph; wrong registrations and fixes are found by graduated non-convexity.
 
@@ -124,7 +139,7 @@ def solve(
     robust : False takes every registration and fix at its word.
     """
     config = config or GraphConfig()
-    graph, values, doubtful = _build(keyframes, links, fixes, config)
+    graph, values, doubtful = build(keyframes, links, fixes, config, steps)
     used = np.ones(len(doubtful), bool)
     if robust and doubtful:
         used = _consistent(graph, values, doubtful, config)
@@ -133,7 +148,6 @@ def solve(
     before, after = kept.error(values), kept.error(result)
     marginals, indeterminate = _marginals(kept, result)
     n_links = len(links)
-    heights = np.array([np.isfinite(link.height_m) for link in links], bool)
     logger.info(
         "pose graph: %d keyframes, %d of %d registrations used, error %.1f -> %.1f",
         len(keyframes),
@@ -158,7 +172,9 @@ def solve(
         height_m=np.array([result.atVector(H(p))[0] for p in range(passes)]),
         height_sigma_m=np.sqrt(np.array([covariance(H(p), 1)[0, 0] for p in range(passes)])),
         link_used=used[:n_links],
-        fix_used=used[n_links + int(heights.sum()) :],
+        fix_used=used[n_links + len(steps) :],
+        step_used=used[n_links : n_links + len(steps)],
+        log_evidence=_log_evidence(kept, result, after, keyframes, config),
         error_before=before,
         error_after=after,
         indeterminate=indeterminate,
@@ -166,11 +182,12 @@ def solve(
     )
 
 
-def _build(
+def build(
     keyframes: Keyframes,
     links: Sequence[Link],
     fixes: Sequence[KeyframeFix],
     config: GraphConfig,
+    steps: Sequence[HeightStep] = (),
 ) -> tuple[Any, Any, list[int]]:
     """Return the graph, its start (no correction) and the indices of factors that may be wrong."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -179,12 +196,11 @@ def _build(
     doubtful: list[int] = []
     for number, link in enumerate(links):
         doubtful.append(_add_link(graph, values, keyframes, link, number))
-    for link in links:
-        if np.isfinite(link.height_m):
-            doubtful.append(graph.size())
-            a, b = (int(keyframes.strip[k]) for k in (link.first, link.second))
-            noise = gtsam.noiseModel.Isotropic.Sigma(1, link.height_sigma_m)
-            graph.add(gtsam.BetweenFactorVector(H(a), H(b), np.array([link.height_m]), noise))
+    for step in steps:
+        doubtful.append(graph.size())
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, step.sigma_m)
+        height = np.array([step.height_m])
+        graph.add(gtsam.BetweenFactorVector(H(step.first), H(step.second), height, noise))
     for fix in fixes:
         doubtful.append(graph.size())
         noise = gtsam.noiseModel.Gaussian.Covariance(fix.covariance_m2)
@@ -199,12 +215,25 @@ def _add_passes(graph: Any, values: Any, keyframes: Keyframes, config: GraphConf
     # One compass steers the dead reckoning and points the sonar: their errors are mostly one.
     covariance[1, 2] = covariance[2, 1] = bias**2
     errors = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    kept = config.shared
+    # A linear factor takes independent noise only, so it is whitened beforehand.
+    white = np.linalg.inv(np.linalg.cholesky((1.0 - kept**2) * covariance))
+    unit = gtsam.noiseModel.Unit.Create(3)
     height = gtsam.noiseModel.Isotropic.Sigma(1, config.height_m)
+    same_dive = _same_dive(keyframes)
     for p in range(len(keyframes.starts) - 1):
         values.insert(B(p), np.zeros(3))
         values.insert(H(p), np.zeros(1))
-        graph.add(gtsam.PriorFactorVector(B(p), np.zeros(3), errors))
+        if kept and same_dive[p]:
+            graph.add(_linear((B(p - 1), -kept * white), (B(p), white), unit))
+        else:
+            graph.add(gtsam.PriorFactorVector(B(p), np.zeros(3), errors))
         graph.add(gtsam.PriorFactorVector(H(p), np.zeros(1), height))
+
+
+def _same_dive(keyframes: Keyframes) -> BoolArray:
+    """Return (p,) which passes follow the one before in the same dive."""
+    return np.isfinite(keyframes.way_m[keyframes.starts[:-1]])
 
 
 def _add_odometry(
@@ -264,7 +293,8 @@ def _linear(*terms: Any) -> Any:
     at = gtsam.Values()
     for key, matrix in blocks:
         at.insert(key, np.zeros(matrix.shape[1]))
-    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*flat, np.zeros(2), noise), at)
+    rows = blocks[0][1].shape[0]
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*flat, np.zeros(rows), noise), at)
 
 
 def _consistent(graph: Any, values: Any, doubtful: list[int], config: GraphConfig) -> BoolArray:
@@ -288,7 +318,24 @@ def _gauss_newton() -> Any:
     return parameters
 
 
+def _log_evidence(
+    graph: Any, result: Any, error: float, keyframes: Keyframes, config: GraphConfig
+) -> float:
+    """Return the log-probability of the data, all unknowns integrated out, up to a constant of the data.
+
+    Of the noise models' own determinants only the one that `shared` changes is counted.
+    """
+    try:
+        half_log_det = float(graph.linearize(result).eliminateMultifrontal().logDeterminant())
+    except RuntimeError:
+        return float("nan")
+    chained = int(_same_dive(keyframes).sum()) if config.shared else 0
+    return float(-error - half_log_det - 1.5 * chained * np.log(1.0 - config.shared**2))
+
+
 def _without(graph: Any, dropped: Sequence[int]) -> Any:
+    if not dropped:
+        return graph
     kept, gone = gtsam.NonlinearFactorGraph(), set(dropped)
     for index in range(graph.size()):
         if index not in gone:

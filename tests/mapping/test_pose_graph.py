@@ -10,7 +10,7 @@ from scipy import stats
 
 from mapping.fixes import PositionFix
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
-from mapping.pose_graph import GraphConfig, Link, Solution, perpendicular, solve
+from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, perpendicular, solve
 from perception.records import FloatArray
 from tests.mapping.worlds import Drift, Flight, crossed_legs, fly, make_world
 
@@ -169,14 +169,12 @@ def test_a_height_offset_between_strips_is_found() -> None:
     flown = flights(rng)
     keyframes = choose_keyframes([f.strip for f in flown], 8.0)
     planted = np.array([0.0, 0.2, -0.1, 0.3, 0.1, -0.2])
-    links = [
-        Link(
-            k.first, k.second, k.first_offset_m, k.second_offset_m, k.shift_m, k.covariance_m2,
-            float(planted[keyframes.strip[k.second]] - planted[keyframes.strip[k.first]]), 0.02,
-        )
-        for k in true_links(flown, keyframes, rng)
-    ]  # fmt: skip
-    solution = solve(keyframes, links)
+    steps = [
+        HeightStep(i, j, float(planted[j] - planted[i]), 0.02)
+        for i in range(3)
+        for j in range(3, 6)
+    ]
+    solution = solve(keyframes, steps=steps)
     found = solution.height_m - solution.height_m.mean()
     np.testing.assert_allclose(found, planted - planted.mean(), atol=0.01)
 
