@@ -16,6 +16,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "echoes": ("echoes", "echoes to strips: pings a minute, heights of objects against truth"),
     "mapping": ("mapping", "one map from many passes: registration, pose graph, gridding, peers"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
+    "navigation-matching": (
+        "navigation_matching",
+        "Patches placed on a map, heading known or not: compact map beside correlation.",
+    ),
     "navigation-montecarlo": ("navigation_montecarlo", "False fixes over terrains, drawn errors."),
     "navigation": (
         "navigation",

@@ -50,3 +50,29 @@ def test_reasons_with_commas_and_quotes_survive_the_csv(tmp_path: Path) -> None:
     assert row["accepted"] == "false"
     assert row["reason"] == "too flat, 'mud'"
     assert float(row["protection_m"]) == 4.5
+
+
+def test_what_locate_writes_is_read_back_without_what_it_refused(tmp_path: Path) -> None:
+    good = PositionFix(20.0, 2.0, 3.0, 0.1, 0.05, 0.2, "profile", True, "fits", 4.5)
+    bad = PositionFix(10.0, 9.0, 9.0, 0.1, 0.0, 0.2, "patch", False, "ambiguous", 4.5)
+    write_fixes(tmp_path / "fixes.csv", [bad, good])
+    (read,) = read_fixes(tmp_path / "fixes.csv")
+    assert (read.time_s, read.easting_m, read.kind) == (20.0, 2.0, "profile")
+    assert read.cov_en_m2 == pytest.approx(0.05)
+    assert read.protection_m == pytest.approx(4.5)
+
+
+def test_a_covariance_that_is_none_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "fixes.csv"
+    path.write_text("time_s,easting_m,northing_m,cov_ee_m2,cov_en_m2,cov_nn_m2\n1,2,3,1,2,1\n")
+    with pytest.raises(InputError, match="line 2: sigma_m must be positive"):
+        read_fixes(path)
+
+
+def test_fixes_none_of_which_was_accepted_are_no_fixes(tmp_path: Path) -> None:
+    refused = PositionFix(
+        10.0, 9.0, 9.0, 0.1, 0.0, 0.2, "profile", False, "the ground gives no fix"
+    )
+    write_fixes(tmp_path / "fixes.csv", [refused])
+    with pytest.raises(InputError, match="no fix of 1 that was accepted"):
+        read_fixes(tmp_path / "fixes.csv")
