@@ -234,10 +234,14 @@ def load_plan(path: Path) -> TilePlan:
 
 
 def _strip_of(said: dict[str, Any], arrays: dict[str, FloatArray]) -> FiledStrip:
-    altitude_m = arrays.pop("altitude_m")
     strip = PlacedStrip(
-        *(arrays[name] for name in ("across_m", *_POSES[:4], "reach_m")),
+        across_m=arrays["across_m"],
+        easting_m=arrays["easting_m"],
+        northing_m=arrays["northing_m"],
+        heading_rad=arrays["heading_rad"],
+        position_m2=arrays["position_m2"],
+        reach_m=arrays["reach_m"],
         height_m=said["height_m"],
         height_sigma_m=said["height_sigma_m"],
     )
-    return filed(StripFile(Path(said["path"]), said["digest"]), strip, altitude_m)
+    return filed(StripFile(Path(said["path"]), said["digest"]), strip, arrays["altitude_m"])

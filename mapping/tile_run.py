@@ -49,7 +49,7 @@ def fuse_tiles(
     """
     store = TileStore.create(folder, plan)
     tiles, keys = plan.tiles(), {tile: plan.key(tile) for tile in plan.tiles()}
-    missing = [tile for tile in tiles if store.figures(tile, keys[tile]) is None]
+    missing = _missing(store, keys)
     path = Path(folder).absolute() / "plan.npz"
     save_plan(path, plan)
     stamp = existing_file(path).stat().st_mtime_ns
@@ -62,6 +62,16 @@ def fuse_tiles(
         progress("fusing tiles", done, len(tiles))
     figures = [store.figures(tile, keys[tile]) or {} for tile in tiles]
     return store, figures, len(missing)
+
+
+def tiles_to_make(plan: TilePlan, folder: Path) -> int:
+    """Return how many tiles of a plan a folder lacks: few are not worth a cluster."""
+    store = TileStore.create(folder, plan)
+    return len(_missing(store, {tile: plan.key(tile) for tile in plan.tiles()}))
+
+
+def _missing(store: TileStore, keys: dict[Tile, str]) -> list[Tile]:
+    return [tile for tile, key in keys.items() if store.figures(tile, key) is None]
 
 
 def make_tile(plan_path: str, stamp: int, tile: Tile, key: str) -> Tile:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from perception.records import BathynavError
@@ -13,8 +15,9 @@ class SchedulerLostError(BathynavError):
     """The cluster cannot be reached, or went away."""
 
 
-def open_cluster(scheduler: str | None = None, n_workers: int | None = None) -> Any:
-    """Return a Dask client as a context manager: a cluster's by address, or a local one's.
+@contextmanager
+def open_cluster(scheduler: str | None = None, n_workers: int | None = None) -> Iterator[Any]:
+    """Yield a Dask client: a cluster's by address, or that of a local one, which ends with the block.
 
     Parameters
     ----------
@@ -32,21 +35,33 @@ def open_cluster(scheduler: str | None = None, n_workers: int | None = None) -> 
     logging.getLogger("distributed").setLevel(logging.ERROR)
     if scheduler is not None:
         try:
-            return Client(scheduler, timeout="10s", set_as_default=False)
+            client = Client(scheduler, timeout="10s", set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
             raise SchedulerLostError(
                 f"no Dask scheduler answers at {scheduler} ({error}); start one with "
                 "`dask scheduler`, or leave --scheduler out"
             ) from error
-    # Runs have their own memory limit; Dask's would kill a worker for what its server's child took.
-    dask.config.set({"distributed.worker.memory.terminate": False})
-    cluster = LocalCluster(
-        n_workers=n_workers or os.cpu_count() or 1,
-        # numba's workqueue layer aborts a process that enters it from two threads.
-        threads_per_worker=1,
-        processes=True,
-        memory_limit=0,
-        host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",  # Dask's default binds every interface
+        with client:
+            yield client
+        return
+    dask.config.set(
+        {
+            # Runs have their own memory limit; Dask's would kill a worker for what its server's child took.
+            "distributed.worker.memory.terminate": False,
+            # What a worker has to say of its own end is not for the user.
+            "logging.distributed": "critical",
+        }
     )
-    return Client(cluster, set_as_default=False)
+    with (
+        LocalCluster(
+            n_workers=n_workers or os.cpu_count() or 1,
+            # numba's workqueue layer aborts a process that enters it from two threads.
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=0,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",  # Dask's default binds every interface
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client

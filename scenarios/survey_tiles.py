@@ -9,6 +9,7 @@ docs/any-size.md has the flow, what it costs and where its limits lie.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from mapping.survey import CorrectedSurvey, SurveyConfig, correct_survey
 from mapping.textures import MatchConfig
 from mapping.tile_figures import map_figures
 from mapping.tile_plan import TILE_CELLS, TilePlan, filed, plan_tiles
-from mapping.tile_run import fuse_tiles
+from mapping.tile_run import fuse_tiles, tiles_to_make
 from mapping.tile_store import TileStore
 from perception.objects import ObjectTable
 from perception.readers import Survey
@@ -34,6 +35,9 @@ from scenarios.survey_map import corrected_objects, identity, navigated_track, w
 # A map of more cells than this is made in tiles without being asked: in one piece it would take some
 # hundred bytes a cell and pass, several GB.
 MOST_CELLS_AT_ONCE = 25_000_000
+# Likewise for the joint method, which takes 1.6 kB a cell; it may still be asked for up to the limit above.
+MOST_JOINT_CELLS = 6_000_000
+_TILES_MADE_HERE = 8
 # Pictures and a prior map's tie look at every so manieth cell, this many at most.
 _PICTURE_CELLS = 4_000_000
 
@@ -116,7 +120,9 @@ def map_tiles(
         for index, one in enumerate(passes)
     ]
     plan = plan_tiles(strips, cell, survey.crs, survey.datum, tile_cells)
-    with open_cluster(scheduler, workers) as client:
+    # A local cluster takes seconds to start: a handful of tiles is made here in that time.
+    alone = scheduler is None and tiles_to_make(plan, folder) <= _TILES_MADE_HERE
+    with nullcontext() if alone else open_cluster(scheduler, workers) as client:
         store, tiles, made = fuse_tiles(plan, folder, client, progress)
     raw = navigated_track(survey)
     return TiledSurvey(
@@ -159,14 +165,31 @@ def _placed(one: FiledPass, corrected: CorrectedSurvey, index: int) -> PlacedStr
     )
 
 
-def expected_cells(survey: Survey, cell_m: float | None) -> int:
-    """Return about how many cells a survey's map will have, from the pings' headers alone."""
+def expected_size(survey: Survey) -> tuple[float, float]:
+    """Return about how far a survey's map will reach east and north, m, from the pings' headers alone."""
     pings = survey.pings
     used = pings.pass_index >= 0
     reach_m = float(np.median((pings.sample_m * pings.samples)[used]))
-    size = [float(np.ptp(v[used])) + 2 * reach_m for v in (pings.easting_m, pings.northing_m)]
+    east, north = (
+        float(np.ptp(v[used])) + 2 * reach_m for v in (pings.easting_m, pings.northing_m)
+    )
+    return east, north
+
+
+def expected_cells(survey: Survey, cell_m: float | None, method: str = "joint") -> int:
+    """Return about how many cells a survey's map will have, likewise.
+
+    Where no cell is asked for, about the one that the method would choose.
+    """
+    pings = survey.pings
+    used = pings.pass_index >= 0
     if cell_m is None:
         step = np.hypot(np.diff(pings.easting_m[used]), np.diff(pings.northing_m[used]))
-        columns = max(2 * float(np.median(pings.sample_m[used])), reach_m / 500)
-        cell_m = max(float(np.median(step)), columns)
-    return int(size[0] * size[1] / cell_m**2)
+        along_m, sample_m = float(np.median(step)), float(np.median(pings.sample_m[used]))
+        reach_m = float(np.median((pings.sample_m * pings.samples)[used]))
+        if method == "joint":
+            cell_m = max(2 * along_m, reach_m / 100)
+        else:
+            cell_m = max(along_m, 2 * sample_m, reach_m / 500)
+    east, north = expected_size(survey)
+    return int(east * north / max(cell_m, 1e-3) ** 2)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +23,35 @@ _FIX_REACH_S = 3600.0  # fixes further from every ping say nothing of the survey
 if TYPE_CHECKING:
     from mapping.fixes import PositionFix
     from perception.readers import Survey
-    from perception.records import FloatArray, Grid
-    from scenarios.survey_map import SurveyMap
+    from perception.records import Grid, Progress
+
+
+def _finite(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
+    """Refuse a number that is none: click takes `nan` and `inf` for numbers of any range."""
+    if value is not None and not math.isfinite(value):
+        raise click.BadParameter(f"{value} is no length; give metres, as {param.opts[0]} 0.5")
+    return value
+
+
+@dataclass(frozen=True, slots=True)
+class _Tiling:
+    """How a map in tiles is made, as the options say."""
+
+    asked: bool
+    tile_cells: int
+    scheduler: str | None
+    workers: int | None
 
 
 @click.command()
 @click.argument("surveys", nargs=-1, required=True, type=click.Path(path_type=Path))
 @out_option
-@click.option("--cell", type=click.FloatRange(min=0, min_open=True), help="Cell of the map, m.")
+@click.option(
+    "--cell",
+    type=click.FloatRange(min=0, min_open=True),
+    callback=_finite,
+    help="Cell of the map, m.",
+)
 @click.option("--crs", help="Projected CRS in metres (EPSG:N); default the data's UTM zone.")
 @click.option("--prior", type=click.Path(path_type=Path), help="A map to tie the heights to.")
 @click.option("--fixes", type=click.Path(path_type=Path), help="Absolute fixes, a CSV file.")
@@ -39,10 +61,26 @@ if TYPE_CHECKING:
 @click.option(
     "--method",
     type=click.Choice(["joint", "shadow"]),
-    default="joint",
-    show_default=True,
-    help="All echoes jointly, or heights from shadows alone.",
+    help="All echoes jointly (default), or heights from shadows alone (always so in tiles).",
 )
+@click.option(
+    "--also",
+    multiple=True,
+    metavar="NAME.nc|.grd|.bag|.asc",
+    help="The map in another format as well, beside map.tif.",
+)
+@click.option(
+    "--tiles", is_flag=True, help="Make the map in tiles; the default beyond 25 million cells."
+)
+@click.option(
+    "--tile-cells",
+    type=click.IntRange(min=16, max=8192),
+    default=1024,
+    show_default=True,
+    help="Cells on a tile's side.",
+)
+@click.option("--scheduler", help="Dask scheduler (tcp://HOST:PORT) whose workers make the tiles.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes that make tiles here.")
 @common_options
 def command(
     surveys: tuple[Path, ...],
@@ -54,7 +92,12 @@ def command(
     install: Path | None,
     tide: Path | None,
     sound_speed: str | None,
-    method: str,
+    method: str | None,
+    also: tuple[str, ...],
+    tiles: bool,
+    tile_cells: int,
+    scheduler: str | None,
+    workers: int | None,
     quiet: bool,
     verbose: bool,
 ) -> None:
@@ -62,6 +105,7 @@ def command(
 
     \b
     bathynav map survey.xtf --out map --fixes surface-fixes.csv
+    bathynav map lines/*.xtf --out map --tiles --cell 0.25 --also map.nc
     """
     import time
 
@@ -69,9 +113,10 @@ def command(
     from mapping.rasters import read_map
     from perception.installation import read_installation
     from perception.readers import open_survey
-    from scenarios.survey_map import map_survey
+    from scenarios.outputs import write_metrics
 
     set_verbosity(quiet, verbose)
+    _check_formats(also)
     prepare_out(out)
     absolute = read_fixes(fixes) if fixes is not None else []
     old = read_map(prior) if prior is not None else None
@@ -84,98 +129,116 @@ def command(
                 click.echo(f"note: {warning}", err=True)
         if absolute:
             check_fixes(fixes, absolute, survey)
-        result = map_survey(survey, fixes=absolute, cell_m=cell, method=method, progress=progress)
-        metrics = _write(out, survey, result)
-        if old is not None:
-            metrics |= tie_to_prior(out, result.grid, old)
+        tiling = _Tiling(tiles, tile_cells, scheduler, workers)
+        method, in_tiles = _choose(survey, cell, method, tiling, quiet)
+        if in_tiles:
+            metrics = _in_tiles(out, survey, absolute, cell, tiling, old, progress)
+        else:
+            metrics = _in_one_piece(out, survey, absolute, cell, method, old, progress)
+        _export(out, also)
     config = {
         "surveys": [str(p) for p in surveys], "cell_m": cell, "crs": survey.crs, "method": method,
         "prior": prior, "fixes": fixes, "install": install, "tide": tide,
-        "sound_speed": sound_speed,
+        "sound_speed": sound_speed, "tile_cells": tile_cells if in_tiles else None,
+        "also": list(also) or None,
     }  # fmt: skip
-    from scenarios.outputs import write_metrics
-
     metrics["seconds"] = time.perf_counter() - began
     write_metrics(out, metrics, config)
     if not quiet:
         _tell(metrics, out)
 
 
-def _write(out: Path, survey: Survey, result: SurveyMap) -> dict[str, Any]:
-    """Write the folder's files and return its metrics."""
-    from mapping.mosaic import echo_mosaic, write_mosaic
-    from mapping.rasters import write_map
-    from mapping.trajectories import from_true_north, write_trajectory
-    from scenarios.plots_survey import plot_layer, plot_map
+def _check_formats(also: tuple[str, ...]) -> None:
+    """Refuse a format before any work is done."""
+    from mapping.exports import FORMATS
+    from perception.records import InputError
 
-    write_map(out / "map.tif", result.grid)
-    write_trajectory(out / "trajectory.csv", from_true_north(result.track))
-    write_trajectory(out / "trajectory-navigated.csv", from_true_north(result.raw_track))
-    _write_soundings(out / "soundings.csv", result)
-    plot_map(out / "map.png", result.grid, result.raw_track, result.track)
-    if result.grid.sigma_m is not None:
-        plot_layer(out / "sigma.png", result.grid, result.grid.sigma_m, "1-sigma, m", "magma")
-    mosaic = echo_mosaic(result.corrected.strips, result.grid.cell_m, survey.crs)
-    write_mosaic(out / "mosaic.tif", mosaic)
-    plot_layer(out / "mosaic.png", mosaic, mosaic.elevation_m, "echo over nominal, dB", "gray")
-    return _metrics(survey, result) | _write_objects(out, result)
+    for name in also:
+        if Path(name).suffix not in FORMATS or Path(name).name != name:
+            raise InputError(
+                f"--also {name}: give a file's name (no folder) that ends in {', '.join(FORMATS)}"
+            )
 
 
-def _write_objects(out: Path, result: SurveyMap) -> dict[str, Any]:
-    """Write the objects of every pass, and those that several passes share as one."""
-    import numpy as np
+def _choose(
+    survey: Survey, cell_m: float | None, method: str | None, tiling: _Tiling, quiet: bool
+) -> tuple[str, bool]:
+    """Return the method, and whether the map is made in tiles; refuse cells as large as the survey."""
+    from perception.records import InputError
+    from scenarios.survey_tiles import (
+        MOST_CELLS_AT_ONCE,
+        MOST_JOINT_CELLS,
+        expected_cells,
+        expected_size,
+    )
 
-    from mapping.objects import merge_objects, write_objects
-    from perception.objects import ObjectTable, write_objects_csv
-
-    tables = result.objects
-    write_objects_csv(out / "objects.csv", ObjectTable.joined(list(tables)))
-    sigma_m = []
-    for summary in result.passes:
-        rows = summary.strip.ping
-        place_m2 = (
-            result.track.sigma_easting_m[rows] ** 2 + result.track.sigma_northing_m[rows] ** 2
+    size_m = expected_size(survey)
+    if cell_m is not None and cell_m > min(size_m) / 4:
+        raise InputError(
+            f"--cell {cell_m:g} m: the survey is {size_m[0]:.0f} x {size_m[1]:.0f} m, so there would "
+            f"be no map to speak of; give {min(size_m) / 40:.2g} or less"
         )
-        # Between passes of one survey half a metre is what beam width and layover leave at least.
-        sigma_m.append(max(0.5, float(np.sqrt(0.5 * np.nanmean(place_m2)))))
-    merged = merge_objects(tables, sigma_m)
-    write_objects(out / "objects.gpkg", merged, result.grid.crs)
-    return {
-        "objects": sum(len(t) for t in tables),
-        "objects_merged": len(merged.height_m),
-        "objects_disputed": int(merged.disputed.sum()),
-    }
+    cells = expected_cells(survey, cell_m, method or "joint")
+    most = MOST_CELLS_AT_ONCE if method or cell_m is None else MOST_JOINT_CELLS
+    if not tiling.asked and cells <= most:
+        return method or "joint", False
+    if method == "joint":
+        raise InputError(
+            f"--method joint: a map of about {cells / 1e6:.3g} million cells is made in tiles, and the "
+            "joint method knows none (docs/any-size.md); give --method shadow, or a larger --cell "
+            "without --tiles"
+        )
+    if not tiling.asked and method is None and not quiet:
+        click.echo(
+            f"note: about {cells / 1e6:.0f} million cells: made in tiles, from shadow heights",
+            err=True,
+        )
+    return "shadow", True
 
 
-def _metrics(survey: Survey, result: SurveyMap) -> dict[str, Any]:
-    import numpy as np
+def _in_one_piece(
+    out: Path,
+    survey: Survey,
+    fixes: list[PositionFix],
+    cell_m: float | None,
+    method: str,
+    old: Grid | None,
+    progress: Progress,
+) -> dict[str, Any]:
+    from scenarios.map_files import tie_to_prior, write_whole
+    from scenarios.survey_map import map_survey
 
-    from mapping.quality import survey_quality
+    result = map_survey(survey, fixes=fixes, cell_m=cell_m, method=method, progress=progress)
+    # Tied before anything is written: every file of the folder is of one height.
+    tie = None if old is None else tie_to_prior(result.grid, old)
+    return write_whole(out, survey, result, tie) | ({} if tie is None else tie.metrics())
 
-    grid, said = result.grid, result.corrected.diagnostics
-    seen = np.isfinite(grid.elevation_m)
-    last = said.rounds[-1] if said.rounds else None
-    return {
-        "pings": survey.n_pings,
-        "pings_used": int((survey.pings.pass_index >= 0).sum()),
-        "passes": survey.n_passes,
-        "cell_m": grid.cell_m,
-        "cells": int(seen.sum()),
-        "area_m2": float(seen.sum() * grid.cell_m * grid.cell_north_m),
-        "elevation_min_m": float(np.min(grid.elevation_m[seen])),
-        "elevation_max_m": float(np.max(grid.elevation_m[seen])),
-        "sigma_median_m": None if grid.sigma_m is None else float(np.median(grid.sigma_m[seen])),
-        "registrations_compared": 0 if last is None else last.compared,
-        "registrations_accepted": 0 if last is None else last.accepted,
-        "registrations_used": 0 if last is None else last.used,
-        "rounds": len(said.rounds),
-        "fixes_used": said.fixes_used,
-        "fixes_refused": said.fixes_refused,
-        "largest_correction_m": said.largest_correction_m,
-        "track_indeterminate": said.indeterminate,
-        "track_worsened": said.worsened,
-        **survey_quality(result.corrected.strips, grid, result.track),
-    }
+
+def _in_tiles(
+    out: Path,
+    survey: Survey,
+    fixes: list[PositionFix],
+    cell_m: float | None,
+    tiling: _Tiling,
+    old: Grid | None,
+    progress: Progress,
+) -> dict[str, Any]:
+    from scenarios.map_files import tie_to_prior, write_tiled
+    from scenarios.survey_tiles import map_tiles
+
+    result = map_tiles(
+        survey, out / "tiles", fixes=fixes, cell_m=cell_m, tile_cells=tiling.tile_cells,
+        scheduler=tiling.scheduler, workers=tiling.workers, progress=progress,
+    )  # fmt: skip
+    tie = None if old is None else tie_to_prior(result.overview(), old)
+    return write_tiled(out, survey, result, tie, progress) | ({} if tie is None else tie.metrics())
+
+
+def _export(out: Path, also: tuple[str, ...]) -> None:
+    from mapping.exports import export_map
+
+    for name in also:
+        export_map(out / "map.tif", out / name)
 
 
 def check_fixes(path: Path | None, fixes: list[PositionFix], survey: Survey) -> None:
@@ -194,58 +257,6 @@ def check_fixes(path: Path | None, fixes: list[PositionFix], survey: Survey) -> 
             f"{path}: no fix lies within an hour of the survey "
             f"({np.datetime64(int(first), 's')} to {np.datetime64(int(last), 's')} UTC); "
             "is it of another day, or in local time?"
-        )
-
-
-def tie_to_prior(out: Path, grid: Grid, old: Grid) -> dict[str, Any]:
-    """Shift the map's heights onto a prior map's, say by how much, and how the two still differ.
-
-    The shift is the median difference: tide and depth bias are common to a survey, changes of the
-    floor are not.
-    """
-    from mapping.compare import difference, write_changes
-    from mapping.rasters import write_map
-
-    shift_m = _prior_shift(difference(grid, old).grid.elevation_m)
-    tied = replace(grid, elevation_m=grid.elevation_m + shift_m, datum=old.datum or grid.datum)
-    left = difference(tied, old)
-    write_map(out / "map.tif", tied)
-    write_changes(out / "prior-changes.gpkg", left)
-    return {"prior_shift_m": shift_m} | {f"prior_{k}": v for k, v in left.statistics.items()}
-
-
-def _prior_shift(difference_m: FloatArray) -> float:
-    import numpy as np
-
-    return float(np.nanmedian(difference_m))
-
-
-def _write_soundings(path: Path, result: SurveyMap) -> None:
-    """Write what the first returns alone say of the floor below the corrected track."""
-    import numpy as np
-
-    from perception.files import whole_file
-
-    strips = result.corrected.strips
-    columns = [
-        np.concatenate([s.easting_m for s in strips]),
-        np.concatenate([s.northing_m for s in strips]),
-        np.concatenate(
-            [
-                -(s.depth_m + s.altitude_m) + offset_m
-                for s, offset_m in zip(strips, result.corrected.height_m, strict=True)
-            ]
-        ),
-        np.concatenate([s.altitude_sigma_m for s in strips]),
-    ]
-    with whole_file(path) as temporary:
-        np.savetxt(
-            temporary,
-            np.column_stack(columns),
-            fmt="%.3f",
-            delimiter=",",
-            header="easting_m,northing_m,elevation_m,sigma_m",
-            comments="",
         )
 
 

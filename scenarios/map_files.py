@@ -1,0 +1,239 @@
+"""What `bathynav map` leaves in its folder, of a map in one piece or in tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from mapping.cog import Frame, Slices, write_cog
+from mapping.compare import Difference, difference, write_changes
+from mapping.mosaic import echo_mosaic, write_mosaic
+from mapping.objects import merge_objects, write_objects
+from mapping.quality import (
+    S44_ORDERS,
+    crossing_figures,
+    horizontal_95,
+    order_met,
+    survey_quality,
+)
+from mapping.rasters import write_map
+from mapping.survey import CorrectedSurvey
+from mapping.tracks import write_tracks
+from mapping.trajectories import from_true_north, write_trajectory
+from perception.files import whole_file
+from perception.objects import ObjectTable, write_objects_csv
+from perception.readers import Survey
+from perception.records import ElevationStrip, Grid, Progress, Trajectory, silent
+from scenarios.plots_survey import plot_layer, plot_map
+from scenarios.survey_map import SurveyMap
+from scenarios.survey_tiles import TiledSurvey
+
+
+@dataclass(frozen=True, slots=True)
+class Tie:
+    """How a map was tied to a prior one: the shift of its heights, the datum, and what is left."""
+
+    shift_m: float
+    datum: str
+    left: Difference
+
+    def metrics(self) -> dict[str, Any]:
+        return {"prior_shift_m": self.shift_m} | {
+            f"prior_{name}": value for name, value in self.left.statistics.items()
+        }
+
+
+def tie_to_prior(grid: Grid, old: Grid) -> Tie:
+    """Find the shift of heights that brings a map onto a prior one, and how the two still differ.
+
+    The shift is the median difference: tide and depth bias are common to a survey, changes of the
+    floor are not.
+    """
+    shift_m = float(np.nanmedian(difference(grid, old).grid.elevation_m))
+    datum = old.datum or grid.datum
+    tied = replace(grid, elevation_m=grid.elevation_m + shift_m, datum=datum)
+    return Tie(shift_m, datum, difference(tied, old))
+
+
+def write_whole(
+    out: Path, survey: Survey, result: SurveyMap, tie: Tie | None = None
+) -> dict[str, Any]:
+    """Write the folder of a map in one piece; return its metrics."""
+    grid = result.grid
+    if tie is not None:
+        grid = replace(grid, elevation_m=grid.elevation_m + tie.shift_m, datum=tie.datum)
+    write_map(out / "map.tif", grid)
+    mosaic = echo_mosaic(result.corrected.strips, grid.cell_m, survey.crs)
+    write_mosaic(out / "mosaic.tif", mosaic)
+    _write_pictures(out, grid, mosaic, result.raw_track, result.track)
+    pings = [summary.strip.ping for summary in result.passes]
+    shared = _write_shared(out, survey, result, pings, tie)
+    seen = np.isfinite(grid.elevation_m)
+    return (
+        shared
+        | {
+            "cell_m": grid.cell_m,
+            "cells": int(seen.sum()),
+            "area_m2": float(seen.sum() * grid.cell_m * grid.cell_north_m),
+            "elevation_min_m": float(np.min(grid.elevation_m[seen])),
+            "elevation_max_m": float(np.max(grid.elevation_m[seen])),
+            "sigma_median_m": None
+            if grid.sigma_m is None
+            else float(np.median(grid.sigma_m[seen])),
+        }
+        | survey_quality(result.corrected.strips, grid, result.track)
+    )
+
+
+def write_tiled(
+    out: Path,
+    survey: Survey,
+    result: TiledSurvey,
+    tie: Tie | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Write the folder of a map in tiles, a window at a time; return its metrics."""
+    shift_m = 0.0 if tie is None else tie.shift_m
+    plan, store = result.plan, result.store
+    datum = plan.datum if tie is None else tie.datum
+    frame = Frame(plan.west_m, plan.north_m, plan.cell_m, plan.shape, plan.crs, datum)
+
+    def windows(*names: str) -> Iterator[tuple[Slices, dict[str, npt.NDArray[Any]]]]:
+        tiles = plan.tiles()
+        for done, tile in enumerate(tiles, start=1):
+            where = plan.slices(tile)
+            layers = {name: store.read(name, where) for name in names}
+            if "elevation" in layers:
+                layers["elevation"] = layers["elevation"] + np.float32(shift_m)
+            yield where, layers
+            progress("tiles to raster", done, len(tiles))
+
+    bands = ("elevation", "sigma", "count")
+    write_cog(out / "map.tif", frame, bands, windows(*bands))
+    echoes = ((where, {"echo_db": layers["echo"]}) for where, layers in windows("echo"))
+    write_cog(out / "mosaic.tif", frame, ("echo_db",), echoes)
+    grid = result.overview()
+    grid = replace(grid, elevation_m=grid.elevation_m + shift_m)
+    _write_pictures(out, grid, result.overview("echo"), result.raw_track, result.track)
+    pings = [strip.ping for strip in result.strips]
+    shared = _write_shared(out, survey, result, pings, tie)
+    return shared | _tiled_figures(result, shift_m)
+
+
+def _tiled_figures(result: TiledSurvey, shift_m: float) -> dict[str, Any]:
+    """Return the map's figures from its tiles', named as those of a map in one piece."""
+    figures = dict(result.figures)
+    for key in ("elevation_min_m", "elevation_max_m"):
+        figures[key] += shift_m
+    horizontal_m = horizontal_95(result.track)
+    shares = {order: figures[f"s44_{order}_vertical_share"] for order in S44_ORDERS}
+    met = order_met(shares, figures["depth_median_m"], horizontal_m)
+    tiles = len(result.plan.tiles())
+    return (
+        {"cell_m": result.plan.cell_m}
+        | figures
+        | crossing_figures(result.strips)
+        | {"track_horizontal_95_m": horizontal_m, "s44_order_of_uncertainty": met}
+        | {"tiles": tiles, "tiles_made": result.made, "tile_cells": result.plan.tile_cells}
+    )
+
+
+def _write_pictures(
+    out: Path, grid: Grid, mosaic: Grid, raw: Trajectory, track: Trajectory
+) -> None:
+    plot_map(out / "map.png", grid, raw, track)
+    if grid.sigma_m is not None:
+        plot_layer(out / "sigma.png", grid, grid.sigma_m, "1-sigma, m", "magma")
+    plot_layer(out / "mosaic.png", mosaic, mosaic.elevation_m, "echo over nominal, dB", "gray")
+
+
+def _write_shared(
+    out: Path,
+    survey: Survey,
+    result: SurveyMap | TiledSurvey,
+    pings: Sequence[npt.NDArray[Any]],
+    tie: Tie | None,
+) -> dict[str, Any]:
+    """Write tracks, soundings, objects and the prior map's changes; return what is known of the survey."""
+    write_trajectory(out / "trajectory.csv", from_true_north(result.track))
+    write_trajectory(out / "trajectory-navigated.csv", from_true_north(result.raw_track))
+    write_tracks(out / "tracks.gpkg", result.track, result.raw_track)
+    write_soundings(out / "soundings.csv", result.corrected, 0.0 if tie is None else tie.shift_m)
+    changes = out / "prior-changes.gpkg"
+    changes.unlink(missing_ok=True)  # an earlier run's
+    if tie is not None:
+        write_changes(changes, tie.left)
+    objects = _write_objects(out, result.objects, pings, result.track, survey.crs)
+    return _survey_metrics(survey, result.corrected) | objects
+
+
+def _survey_metrics(survey: Survey, corrected: CorrectedSurvey) -> dict[str, Any]:
+    said = corrected.diagnostics
+    last = said.rounds[-1] if said.rounds else None
+    return {
+        "pings": survey.n_pings,
+        "pings_used": int((survey.pings.pass_index >= 0).sum()),
+        "passes": survey.n_passes,
+        "registrations_compared": 0 if last is None else last.compared,
+        "registrations_accepted": 0 if last is None else last.accepted,
+        "registrations_used": 0 if last is None else last.used,
+        "rounds": len(said.rounds),
+        "fixes_used": said.fixes_used,
+        "fixes_refused": said.fixes_refused,
+        "largest_correction_m": said.largest_correction_m,
+        "track_indeterminate": said.indeterminate,
+        "track_worsened": said.worsened,
+    }
+
+
+def _write_objects(
+    out: Path,
+    tables: Sequence[ObjectTable],
+    pings: Sequence[npt.NDArray[Any]],
+    track: Trajectory,
+    crs: str,
+) -> dict[str, Any]:
+    """Write the objects of every pass, and those that several passes share as one."""
+    write_objects_csv(out / "objects.csv", ObjectTable.joined(list(tables)))
+    sigma_m = []
+    for rows in pings:
+        place_m2 = track.sigma_easting_m[rows] ** 2 + track.sigma_northing_m[rows] ** 2
+        # Between passes of one survey half a metre is what beam width and layover leave at least.
+        sigma_m.append(max(0.5, float(np.sqrt(0.5 * np.nanmean(place_m2)))))
+    merged = merge_objects(tables, sigma_m)
+    write_objects(out / "objects.gpkg", merged, crs)
+    return {
+        "objects": sum(len(t) for t in tables),
+        "objects_merged": len(merged.height_m),
+        "objects_disputed": int(merged.disputed.sum()),
+    }
+
+
+def write_soundings(path: Path, corrected: CorrectedSurvey, shift_m: float = 0.0) -> None:
+    """Write what the first returns alone say of the floor below the corrected track.
+
+    Parameters
+    ----------
+    shift_m : added to the heights: the map's tie to a prior one is the soundings' as well.
+    """
+
+    def heights(strip: ElevationStrip, offset_m: float) -> npt.NDArray[Any]:
+        return -(strip.depth_m + strip.altitude_m) + offset_m + shift_m
+
+    strips = corrected.strips
+    columns = [
+        np.concatenate([s.easting_m for s in strips]),
+        np.concatenate([s.northing_m for s in strips]),
+        np.concatenate([heights(s, o) for s, o in zip(strips, corrected.height_m, strict=True)]),
+        np.concatenate([s.altitude_sigma_m for s in strips]),
+    ]
+    with whole_file(path) as temporary:
+        np.savetxt(
+            temporary, np.column_stack(columns), fmt="%.3f", delimiter=",", comments="",
+            header="easting_m,northing_m,elevation_m,sigma_m",
+        )  # fmt: skip
