@@ -15,6 +15,8 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "sonar-files": ("sonar_files", "reading sonar files: pings a second, memory at 1x and 10x"),
     "echoes": ("echoes", "echoes to strips: pings a minute, heights of objects against truth"),
     "mapping": ("mapping", "one map from many passes: registration, pose graph, gridding, peers"),
+    "crossed": ("crossed", "three and three crossed passes that drift, echoes to map and track"),
+    "tiles": ("tiles", "a map that outgrows memory: memory against size, the slowest step"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
     "navigation-matching": (
         "navigation_matching",
