@@ -37,18 +37,39 @@ def three_classes(regions: RegionMap) -> npt.NDArray[np.int32]:
     return THREE_OF_EIGHT[regions.class_code]
 
 
+# The Gaussian distribution function to eight sigma, tabled: interpolated it is right to 1e-6, and erf is
+# ten times dearer.
+_CLEAR = 8.0
+_NODES_PER_SIGMA = 256
+_TABLE = np.array(
+    [0.5 * (1 + erf(k / _NODES_PER_SIGMA / np.sqrt(2))) for k in range(-2048, 2050)], np.float64
+)
+
+
+@njit(cache=True)
+def _below(x: float) -> float:
+    """Return the probability that a standard Gaussian is below x."""
+    if x <= -_CLEAR:
+        return 0.0
+    if x >= _CLEAR:
+        return 1.0
+    place = (x + _CLEAR) * _NODES_PER_SIGMA
+    k = int(place)
+    value: float = _TABLE[k] + (place - k) * (_TABLE[k + 1] - _TABLE[k])
+    return value
+
+
 @njit(cache=True)
 def _sign_probabilities(
     value: float, sigma: float, tolerance: float, out: npt.NDArray[np.float64]
 ) -> None:
     """Write P(below -tolerance), P(within), P(above) of a Gaussian value."""
-    # Eight sigma clear of both tolerances nothing is left to share out (and erf is dear).
-    if sigma <= 0 or abs(value) - tolerance > 8 * sigma:
+    if sigma <= 0:
         out[0] = 1.0 if value < -tolerance else 0.0
         out[2] = 1.0 if value > tolerance else 0.0
     else:
-        out[0] = 0.5 * (1 + erf((-tolerance - value) / (sigma * 1.4142135623730951)))
-        out[2] = 0.5 * (1 + erf((value - tolerance) / (sigma * 1.4142135623730951)))
+        out[0] = _below((-tolerance - value) / sigma)
+        out[2] = _below((value - tolerance) / sigma)
     out[1] = max(1 - out[0] - out[2], 0.0)
 
 

@@ -2,8 +2,10 @@
 
 smooth at the scale that noise and relief ask for   perception.scale
 H and K with their errors                           perception.curvature
+the level of detail that the classes are read at    perception.region_detail
 eight classes and their probabilities               perception.region_classes
-connected regions, the doubtful and small merged    perception.region_labels
+connected regions and their borders                 perception.region_labels
+the doubtful and small merged                       perception.region_merging
 table and graph                                     perception.region_graph
 """
 
@@ -15,23 +17,36 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from perception.curvature import Curvature, Operator, curvature_of
-from perception.records import FloatArray, Grid, InputError, Progress, RegionMap, silent
+from perception.curvature import Curvature, Operator
+from perception.records import (
+    REGION_CLASSES,
+    FloatArray,
+    Grid,
+    InputError,
+    Progress,
+    RegionMap,
+    silent,
+)
 from perception.region_classes import classify
+from perception.region_detail import candidates, curvature_at, tiles, useful
 from perception.region_graph import region_table
 from perception.region_labels import (
-    apply_merge,
-    label_classes,
-    merge_regions,
+    COUNT,
+    MAX_P,
+    SUM_SCALE,
+    fold_borders,
+    fold_sums,
+    label_and_sum,
     region_borders,
-    region_sums,
+    write_merge,
 )
-from perception.scale import Smoothing, smooth, upsample
+from perception.region_merging import join_equal, merge_regions
 
 logger = logging.getLogger(__name__)
 
 # Above this many cells the nine probability planes (36 bytes a cell) are left out unless asked for.
 _PROBABILITY_CELLS = 4_000_000
+_FLAT = REGION_CLASSES.index("flat")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +56,8 @@ class RegionConfig:
     Attributes
     ----------
     scale_m : smoothing (Gaussian sigma or equivalent) for the whole map; None chooses it per cell.
+    detail_m : least scale of the classes, m; 0 the finest that the noise allows; None the finest that
+        gives regions of a useful size. H and K are not touched by it. Not used with `scale_m`.
     operator : derivatives by central differences or by a 3 x 3 least-squares fit.
     k_sigma : H or K within this many of its sigma of zero counts as zero.
     least_H_per_m, least_K_per_m2 : tolerances never fall below these.
@@ -52,6 +69,7 @@ class RegionConfig:
     """
 
     scale_m: float | None = None
+    detail_m: float | None = None
     operator: Operator = "difference"
     k_sigma: float = 2.0
     least_H_per_m: float = 0.0
@@ -64,6 +82,8 @@ class RegionConfig:
     def __post_init__(self) -> None:
         if self.scale_m is not None and not (np.isfinite(self.scale_m) and self.scale_m >= 0):
             raise InputError(f"the scale must be zero or more metres, got {self.scale_m}")
+        if self.detail_m is not None and not (np.isfinite(self.detail_m) and self.detail_m >= 0):
+            raise InputError(f"the detail must be zero or more metres, got {self.detail_m}")
         if self.levels < 1:
             raise InputError(f"levels must be at least 1, got {self.levels}")
 
@@ -77,12 +97,14 @@ class Segmentation:
     coarser : one region map per further level, finest first.
     parents : parents[k][r] is the region of level k + 1 (numbered from 1) that holds most of region
         r + 1 of level k; level 0 is `regions`.
+    detail_m : least scale the classes of `regions` were read at; 0 the curvature's own.
     """
 
     regions: RegionMap
     curvature: Curvature
     coarser: tuple[RegionMap, ...] = ()
     parents: tuple[npt.NDArray[np.int64], ...] = field(default=())
+    detail_m: float = 0.0
 
 
 def segment(
@@ -107,57 +129,50 @@ def segment(
     config = config or RegionConfig()
     if not np.isfinite(grid.elevation_m).any():
         raise InputError("the map holds no height at all (every cell is NaN); nothing to segment")
-    progress("regions", 0, 1 + config.levels)
-    smoothing = _smooth(grid, config)
-    curvature = _curvature(grid, smoothing)
-    progress("regions", 1, 1 + config.levels)
-    finest = _regions(grid, curvature, config)
-    progress("regions", 2, 1 + config.levels)
+    steps = 2 + config.levels
+    progress("regions", 0, steps)
+    detail_m = _detail(grid, config)
+    progress("regions", 1, steps)
+    curvature = curvature_at(grid, config.scale_m, 0.0, config.operator)
+    progress("regions", 2, steps)
+    read = curvature
+    if detail_m > 0:
+        read = curvature_at(grid, config.scale_m, detail_m, config.operator)
+    finest = _regions(grid, read, config)
+    base_m = max(float(np.nanmedian(read.scale_m)), np.sqrt(grid.cell_m * grid.cell_north_m))
+    del read
+    progress("regions", 3, steps)
     coarser: list[RegionMap] = []
     parents: list[npt.NDArray[np.int64]] = []
     below = finest
     for level in range(1, config.levels):
-        coarse_config = replace(config, keep_probability=False)
-        least_scale_m = _level_scale(smoothing, grid, level)
-        rough = _curvature(grid, _smooth(grid, config, least_scale_m))
-        regions = _regions(grid, rough, coarse_config)
+        rough = curvature_at(grid, config.scale_m, base_m * 2.0**level, config.operator)
+        regions = _regions(grid, rough, replace(config, keep_probability=False))
         parents.append(_parents(below, regions))
         coarser.append(regions)
         below = regions
-        progress("regions", 2 + level, 1 + config.levels)
-    return Segmentation(finest, curvature, tuple(coarser), tuple(parents))
+        progress("regions", 3 + level, steps)
+    return Segmentation(finest, curvature, tuple(coarser), tuple(parents), detail_m)
 
 
-def _smooth(grid: Grid, config: RegionConfig, least_scale_m: float = 0.0) -> Smoothing:
-    """Smooth by the configured scale; a coarser level by no less than its own."""
-    scale_m = config.scale_m
-    if scale_m is not None:
-        scale_m = max(scale_m, least_scale_m)
-    return smooth(
-        grid.elevation_m,
-        grid.cell_m,
-        grid.cell_north_m,
-        grid.sigma_m,
-        scale_m,
-        config.operator,
-        least_scale_m,
-    )
-
-
-def _level_scale(smoothing: Smoothing, grid: Grid, level: int) -> float:
-    """Return the smoothing of a coarser level: double for each, from what the finest level took."""
-    base = max(float(np.nanmedian(smoothing.scale_m)), np.sqrt(grid.cell_m * grid.cell_north_m))
-    return base * 2.0**level
-
-
-def _curvature(grid: Grid, smoothing: Smoothing) -> Curvature:
-    mean, gauss, sigma_h, sigma_k = curvature_of(
-        smoothing.derivatives, smoothing.gain, smoothing.noise_m, smoothing.step
-    )
-    scale = upsample(smoothing.scale_m, smoothing.step, grid.shape)
-    scale[np.isnan(mean)] = np.nan
-    noise = upsample(smoothing.noise_m, smoothing.step, grid.shape)
-    return Curvature(mean, gauss, sigma_h, sigma_k, scale, noise)
+def _detail(grid: Grid, config: RegionConfig) -> float:
+    """Return the least scale the classes are read at, m: the finest that gives regions of a useful size."""
+    if config.scale_m is not None:
+        return 0.0
+    if config.detail_m is not None:
+        return config.detail_m
+    trial = replace(config, keep_probability=False)
+    shown = tiles(grid)
+    scales = candidates(grid)
+    for least_m in scales:
+        sizes = []
+        for tile in shown:
+            regions = _regions(tile, curvature_at(tile, None, least_m, config.operator), trial)
+            area_m2, code = regions.table["area_m2"], regions.table["class_code"]
+            sizes.append(area_m2[code != _FLAT] / (grid.cell_m * grid.cell_north_m))
+        if useful(sizes):
+            return least_m
+    return scales[-1]
 
 
 def _regions(grid: Grid, curvature: Curvature, config: RegionConfig) -> RegionMap:
@@ -168,41 +183,33 @@ def _regions(grid: Grid, curvature: Curvature, config: RegionConfig) -> RegionMa
     code, certainty, probability = classify(
         planes, config.k_sigma, config.least_H_per_m, config.least_K_per_m2, keep
     )
-    region, count = label_classes(code)
-    sums = region_sums(
-        region, count, grid.elevation_m, curvature.H, curvature.K, certainty, curvature.scale_m
+    labels = label_and_sum(
+        code, (grid.elevation_m, curvature.H, curvature.K, certainty, curvature.scale_m)
     )
-    class_of = np.zeros(count + 1, np.uint8)
-    class_of[region.ravel()] = code.ravel()
-    edges, border_m = region_borders(region, grid.cell_m, grid.cell_north_m)
+    edges, border_m = region_borders(labels.region, grid.cell_m, grid.cell_north_m)
+    sums = labels.sums
     parent = merge_regions(
         edges,
         border_m,
-        sums[:, 0] * grid.cell_m * grid.cell_north_m,
+        sums[:, COUNT] * grid.cell_m * grid.cell_north_m,
         _least_area(sums, grid, config),
-        sums[:, 9] < config.seed_probability,
+        sums[:, MAX_P] < config.seed_probability,
     )
-    apply_merge(region, code, parent, class_of)
-    region, count = label_classes(code)
-    sums = region_sums(
-        region, count, grid.elevation_m, curvature.H, curvature.K, certainty, curvature.scale_m
-    )
-    class_of = np.zeros(count + 1, np.uint8)
-    class_of[region.ravel()] = code.ravel()
-    edges, border_m = region_borders(region, grid.cell_m, grid.cell_north_m)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    number, class_of = join_equal(edges, parent, labels.class_of)
+    write_merge(labels.region, code, number, class_of)
+    edges, border_m = fold_borders(edges, border_m, number)
     return RegionMap(
         class_code=code,
-        region=region,
+        region=labels.region,
         west_m=grid.west_m,
         north_m=grid.north_m,
         cell_m=grid.cell_m,
         crs=grid.crs,
         cell_height_m=grid.cell_height_m,
         probability=probability,
-        table=region_table(sums, class_of, grid),
-        edges=edges[order],
-        border_m=border_m[order],
+        table=region_table(fold_sums(sums, number), class_of, grid),
+        edges=edges,
+        border_m=border_m,
     )
 
 
@@ -211,7 +218,7 @@ def _least_area(
 ) -> npt.NDArray[np.float64]:
     if config.least_area_m2 is not None:
         return np.full(len(sums), config.least_area_m2)
-    scale_m = sums[:, 12] / np.maximum(sums[:, 0], 1)
+    scale_m = sums[:, SUM_SCALE] / np.maximum(sums[:, COUNT], 1)
     # What is narrower than the smoothing's own footprint cannot be a feature of the surface.
     return np.maximum(9 * grid.cell_m * grid.cell_north_m, np.pi * scale_m**2)
 

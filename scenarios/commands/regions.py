@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     type=float,
     help="Smoothing for the whole map (Gaussian sigma, m); chosen per cell if left out.",
 )
+@click.option("--detail", "detail_m", type=float,
+              help="Least scale of the classes, m; 0 the finest, else chosen to give regions of use.")  # fmt: skip
 @click.option("--map-sigma", "map_sigma_m", type=float, help="1-sigma of the heights, m.")
 @click.option("--levels", type=click.IntRange(1, 8), default=1, show_default=True,
               help="Levels of detail; each coarser one doubles the scale.")  # fmt: skip
@@ -39,6 +41,7 @@ def command(
     map_path: Path,
     out: Path,
     scale_m: float | None,
+    detail_m: float | None,
     map_sigma_m: float | None,
     levels: int,
     objects_path: Path | None,
@@ -70,7 +73,7 @@ def command(
     set_verbosity(quiet, verbose)
     if map_sigma_m is not None and not map_sigma_m >= 0:
         raise InputError(f"--map-sigma must be zero or more metres, got {map_sigma_m}")
-    config = RegionConfig(scale_m=scale_m, levels=levels)
+    config = RegionConfig(scale_m=scale_m, detail_m=detail_m, levels=levels)
     grid = read_map(map_path, map_sigma_m)
     prepare_out(out)
     start = perf_counter()
@@ -108,6 +111,7 @@ def _metrics(result: Segmentation, seconds: float) -> dict[str, Any]:
         "regions": len(regions.table["area_m2"]),
         "borders": len(regions.border_m),
         "scale_median_m": float(np.median(curvature.scale_m[known])),
+        "detail_m": result.detail_m,
         "noise_median_m": float(np.median(curvature.noise_m[known])),
         "class_probability_mean": float(
             np.average(regions.table["class_probability"], weights=regions.table["area_m2"])
@@ -130,6 +134,7 @@ def _print(result: Segmentation, metrics: dict[str, Any], out: Path) -> None:
     rows = [
         ("regions", f"{metrics['regions']} ({metrics['borders']} borders)"),
         ("smoothing (median)", f"{metrics['scale_median_m']:.3g} m"),
+        ("classes read at", f"{result.detail_m:g} m" if result.detail_m > 0 else "that scale"),
         ("independent noise (median)", f"{metrics['noise_median_m']:.3g} m"),
     ]
     codes = result.regions.table["class_code"]

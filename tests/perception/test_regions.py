@@ -7,7 +7,8 @@ from perception.background import lift_objects
 from perception.records import REGION_CLASSES, Grid, InputError
 from perception.region_classes import classify, three_classes
 from perception.region_graph import neighbours
-from perception.region_labels import label_classes, merge_regions, region_borders
+from perception.region_labels import fold_borders, fold_sums, label_and_sum, region_borders
+from perception.region_merging import join_equal, merge_regions
 from perception.regions import RegionConfig, segment, weight_map
 
 RNG = np.random.default_rng
@@ -84,10 +85,13 @@ def test_class_probability_is_the_share_of_draws():
         assert probability[code, 0, 0] == pytest.approx(drawn.mean(), abs=0.004)
 
 
-def test_labels_agree_with_scipy():
+def test_labels_and_sums_agree_with_scipy():
+    """Over seams between strips too, which lie every 64 rows."""
     ndimage = pytest.importorskip("scipy.ndimage")
-    code = RNG(5).integers(0, 4, (60, 70)).astype(np.uint8)
-    region, count = label_classes(code)
+    code = RNG(5).integers(0, 4, (150, 70)).astype(np.uint8)
+    z = RNG(6).normal(size=code.shape)
+    labels = label_and_sum(code, (z, z, z, z, z))
+    region, count = labels.region, len(labels.class_of) - 1
     total = 0
     for c in (1, 2, 3):
         theirs, n = ndimage.label(code == c)
@@ -95,7 +99,54 @@ def test_labels_agree_with_scipy():
         pairs = np.unique(np.stack([region[code == c], theirs[code == c]]), axis=1)
         assert pairs.shape[1] == n  # one to one
     assert count == total
-    assert (region[code == 0] == 0).all()
+    np.testing.assert_array_equal(labels.class_of[region], code)
+    numbers = np.arange(1, count + 1)
+    np.testing.assert_allclose(labels.sums[1:, 6], ndimage.sum(z, region, numbers), atol=1e-9)
+    np.testing.assert_allclose(labels.sums[1:, 10], ndimage.minimum(z, region, numbers))
+    np.testing.assert_allclose(labels.sums[1:, 11], ndimage.maximum(z, region, numbers))
+    first_seen = np.unique(region[region > 0], return_index=True)[1]
+    assert (np.diff(first_seen) > 0).all()
+
+
+def test_merging_on_the_graph_is_what_labelling_the_merged_map_gives():
+    rng = RNG(9)
+    code = rng.integers(1, 4, (100, 60)).astype(np.uint8)
+    z = rng.normal(size=code.shape)
+    labels = label_and_sum(code, (z, z, z, z, z))
+    edges, border_m = region_borders(labels.region, 2.0, 3.0)
+    area = labels.sums[:, 0]
+    weak = rng.uniform(size=len(area)) < 0.2
+    parent = merge_regions(edges, border_m, area, np.full(len(area), 6.0), weak)
+    number, class_of = join_equal(edges, parent, labels.class_of)
+    merged = labels.class_of[parent][labels.region]
+    again = label_and_sum(merged, (z, z, z, z, z))
+    np.testing.assert_array_equal(number[labels.region], again.region)
+    np.testing.assert_array_equal(class_of, again.class_of)
+    np.testing.assert_allclose(fold_sums(labels.sums, number)[1:], again.sums[1:], atol=1e-9)
+    found, expected = fold_borders(edges, border_m, number), region_borders(again.region, 2.0, 3.0)
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_allclose(found[1], expected[1])
+
+
+def test_hills_are_read_at_the_finest_scale_and_rough_ground_at_a_coarser():
+    y, x = np.mgrid[:160, :160]
+    waves = 3 * np.sin(x / 9.0) * np.sin(y / 11.0) + RNG(1).normal(0, 0.02, x.shape)
+    assert segment(grid_of(waves)).detail_m == 0
+    f = np.hypot(np.fft.fftfreq(160)[:, None], np.fft.fftfreq(160))
+    f[0, 0] = 1
+    rough = np.real(np.fft.ifft2(np.fft.fft2(RNG(2).normal(size=(160, 160))) * f**-2.2))
+    rough *= 10 / rough.std()
+    chosen, fine = segment(grid_of(rough)), segment(grid_of(rough), RegionConfig(detail_m=0.0))
+    assert chosen.detail_m >= 2
+    assert fine.detail_m == 0
+    sizes = []
+    for regions in (chosen.regions, fine.regions):
+        area_m2 = np.sort(regions.table["area_m2"][regions.table["class_code"] != 7])
+        running = np.cumsum(area_m2)
+        sizes.append(area_m2[np.searchsorted(running, running[-1] / 2)])
+    assert sizes[0] > 2 * sizes[1]
+    # The curvature is what it is at any detail of the classes.
+    np.testing.assert_array_equal(chosen.curvature.H, fine.curvature.H)
 
 
 def test_borders_are_measured_in_metres():
