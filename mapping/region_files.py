@@ -1,16 +1,15 @@
-"""Region maps on disk: regions.tif, regions.gpkg, curvature.tif, and the style QGIS opens them with.
+"""Region maps on disk: regions.tif, regions.gpkg, curvature.tif; their looks are in `mapping.region_style`.
 
-`regions.qml` beside the two files carries a raster and a vector renderer at once: QGIS looks for a
-style of the file's own name, the two share theirs, and each kind of layer reads its part.
+`regions.gpkg` holds a layer of polygons for each level of detail, finest first, each region with the number of
+its parent on the next level: a tree. The neighbourhoods of the first level are a layer `graph` of lines.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import numpy.typing as npt
@@ -22,57 +21,82 @@ from rasterio.features import shapes
 from rasterio.transform import Affine
 
 from mapping.rasters import write_bands
-from mapping.vectors import write_layer
+from mapping.region_style import CLASS_COLOURS as CLASS_COLOURS
+from mapping.region_style import qgis_style, raster_attributes, style_layers
 from perception.curvature import Curvature
-from perception.files import existing_file, write_text
+from perception.files import existing_file, whole_file, write_text
 from perception.records import REGION_CLASSES, Grid, InputError, RegionMap
+from perception.region_classes import THREE_CLASSES, THREE_OF_EIGHT
 from perception.region_graph import neighbours
 from perception.regions import Segmentation
 
-# Warm is up, cold is down, pale is neither; told apart by lightness too, for those who see no red.
-CLASS_COLOURS = {
-    1: "#b2182b", 2: "#053061", 3: "#ef8a62", 4: "#4393c3",
-    5: "#fddbc7", 6: "#d1e5f0", 7: "#f7f7f7", 8: "#bdbdbd",
-}  # fmt: skip
-
-
-def write_regions(
-    out: Path,
-    regions: RegionMap,
-    curvature: Curvature | None = None,
-    parents: npt.NDArray[Any] | None = None,
-    name: str = "regions",
-) -> None:
-    """Write `NAME.tif`, `NAME.gpkg` and `NAME.qml` into `out`, and `curvature.tif` where given.
-
-    Parameters
-    ----------
-    parents : (n,) region of the next coarser level that holds each region; column `parent`.
-    """
-    frame = frame_of(regions)
-    bands = {"class": regions.class_code, "region": regions.region}
-    tags = {f"CLASS_{code}": text for code, text in enumerate(REGION_CLASSES)}
-    write_bands(out / f"{name}.tif", bands, frame, dtype="int32", nodata=0, tags=tags)
-    write_layer(
-        out / f"{name}.gpkg",
-        region_polygons(regions),
-        _columns(regions, parents),
-        regions.crs,
-        "Polygon",
-    )
-    write_text(out / f"{name}.qml", _style())
-    if curvature is not None:
-        write_curvature(out / "curvature.tif", curvature, frame)
-
 
 def write_segmentation(out: Path, segmentation: Segmentation) -> None:
-    """Write every file of a segmentation; coarser levels as `regions-level-2` and so on."""
+    """Write `regions.tif` (coarser levels `regions-level-2.tif` ...), `regions.gpkg` and `curvature.tif`.
+
+    Beside them go `regions.qml` and the rasters' attribute tables: names and colours of the classes.
+    """
     chain = (segmentation.regions, *segmentation.coarser)
-    for level, regions in enumerate(chain):
-        parents = segmentation.parents[level] if level < len(segmentation.parents) else None
-        name = "regions" if level == 0 else f"regions-level-{level + 1}"
-        curvature = segmentation.curvature if level == 0 else None
-        write_regions(out, regions, curvature, parents, name)
+    names = ["regions", *(f"regions-level-{level}" for level in range(2, len(chain) + 1))]
+    for name, regions in zip(names, chain, strict=True):
+        _write_raster(out / f"{name}.tif", regions)
+        write_text(out / f"{name}.qml", qgis_style())
+    parents = [*segmentation.parents, None]
+    _write_layers(out / "regions.gpkg", names, chain, parents)
+    write_curvature(out / "curvature.tif", segmentation.curvature, frame_of(segmentation.regions))
+
+
+def _write_raster(path: Path, regions: RegionMap) -> None:
+    bands = {"class": regions.class_code, "region": regions.region}
+    tags = {f"CLASS_{code}": text for code, text in enumerate(REGION_CLASSES)}
+    write_bands(path, bands, frame_of(regions), dtype="int32", nodata=0, tags=tags)
+    write_text(path.with_name(f"{path.name}.aux.xml"), raster_attributes())
+
+
+def _write_layers(
+    path: Path,
+    names: Sequence[str],
+    chain: Sequence[RegionMap],
+    parents: Sequence[npt.NDArray[Any] | None],
+) -> None:
+    """Write the polygons of every level, the graph of the first and the layers' style, in one file."""
+    layers = [
+        (name, "Polygon", region_polygons(regions), _columns(regions, above))
+        for name, regions, above in zip(names, chain, parents, strict=True)
+    ]
+    layers.append(("graph", "LineString", *_graph(chain[0])))
+    with whole_file(path) as temporary:
+        try:
+            for k, (name, kind, geometries, columns) in enumerate(layers):
+                pyogrio.raw.write(
+                    temporary,
+                    shapely.to_wkb(geometries),
+                    field_data=list(columns.values()),
+                    fields=list(columns),
+                    crs=chain[0].crs or None,
+                    geometry_type=kind,
+                    driver="GPKG",
+                    layer=name,
+                    append=k > 0,
+                )
+            style_layers(temporary, names)
+        except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+            raise InputError(f"{path}: cannot be written ({error})") from error
+
+
+def _graph(regions: RegionMap) -> tuple[npt.NDArray[Any], dict[str, npt.NDArray[Any]]]:
+    """Return the neighbourhoods as lines from centre to centre, with the length of the border."""
+    table, edges = regions.table, np.asarray(regions.edges)
+    centres = np.column_stack([table["easting_m"], table["northing_m"]])
+    lines: npt.NDArray[Any] = np.empty(0, object)
+    if len(edges):
+        lines = shapely.linestrings(centres[edges - 1])
+    columns: dict[str, npt.NDArray[Any]] = {
+        "region_a": edges[:, 0].astype(np.int32),
+        "region_b": edges[:, 1].astype(np.int32),
+        "border_m": np.asarray(regions.border_m, np.float64),
+    }
+    return lines, columns
 
 
 def write_curvature(path: Path, curvature: Curvature, frame: Grid) -> None:
@@ -120,6 +144,7 @@ def _columns(regions: RegionMap, parents: npt.NDArray[Any] | None) -> dict[str, 
         "region": np.arange(1, count + 1, dtype=np.int32),
         "class": np.array([REGION_CLASSES[c] for c in code], dtype=object),
         "class_code": code,
+        "landform": np.array([THREE_CLASSES[c] for c in THREE_OF_EIGHT[code]], dtype=object),
     }
     for name, values in table.items():
         if name == "axis_rad":
@@ -150,7 +175,7 @@ def _neighbour_columns(regions: RegionMap, count: int) -> tuple[npt.NDArray[Any]
 
 
 def read_regions(path: Path) -> RegionMap:
-    """Read `regions.tif`, and table and graph from the GeoPackage of its name where there is one.
+    """Read `regions.tif`, and table and graph from the GeoPackage beside it where there is one.
 
     Raises
     ------
@@ -168,9 +193,13 @@ def read_regions(path: Path) -> RegionMap:
             f"{path}: GDAL cannot read it as a raster ({error}); give a regions.tif"
         ) from error
     beside = path.with_suffix(".gpkg")
-    if not beside.exists():
+    together = path.with_name("regions.gpkg")  # levels share one file, a layer each
+    if beside.exists():
+        table, edges, border_m = _read_table(beside, 0)
+    elif together.exists():
+        table, edges, border_m = _read_table(together, path.stem)
+    else:
         return regions
-    table, edges, border_m = _read_table(beside)
     return RegionMap(
         regions.class_code, regions.region, regions.west_m, regions.north_m, regions.cell_m,
         regions.crs, regions.cell_height_m, None, table, edges, border_m,
@@ -203,10 +232,10 @@ def _read_bands(path: Path, source: Any) -> RegionMap:
 
 
 def _read_table(
-    path: Path,
+    path: Path, layer: str | int
 ) -> tuple[dict[str, npt.NDArray[Any]], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
     try:
-        meta, _, _, values = pyogrio.raw.read(path, read_geometry=False)
+        meta, _, _, values = pyogrio.raw.read(path, layer=layer, read_geometry=False)
     except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); make it with bathynav regions"
@@ -226,40 +255,8 @@ def _read_table(
     table = {
         name: np.asarray(column)[order]
         for name, column in columns.items()
-        if name not in ("region", "class", "neighbours", "borders_m", "axis_deg")
+        if name
+        not in ("region", "class", "landform", "parent", "neighbours", "borders_m", "axis_deg")
     }
     table["axis_rad"] = np.radians(np.asarray(columns["axis_deg"])[order])
     return table, np.array(edges, np.int64).reshape(-1, 2), np.array(border_m, np.float64)
-
-
-def _style() -> str:
-    """Return a QGIS style with a paletted raster renderer and a categorised vector renderer."""
-    entries, categories, symbols = [], [], []
-    for code, colour in CLASS_COLOURS.items():
-        label = quoteattr(REGION_CLASSES[code])
-        entries.append(f'<paletteEntry value="{code}" color="{colour}" label={label} alpha="255"/>')
-        categories.append(
-            f'<category value="{code}" symbol="{code}" label={label} render="true" type="long"/>'
-        )
-        red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
-        symbols.append(
-            f'<symbol name="{code}" type="fill" alpha="1" clip_to_extent="1">'
-            '<layer class="SimpleFill" enabled="1" locked="0" pass="0"><Option type="Map">'
-            f'<Option name="color" type="QString" value="{red},{green},{blue},160"/>'
-            '<Option name="style" type="QString" value="solid"/>'
-            '<Option name="outline_color" type="QString" value="60,60,60,255"/>'
-            '<Option name="outline_style" type="QString" value="solid"/>'
-            '<Option name="outline_width" type="QString" value="0.1"/>'
-            '<Option name="outline_width_unit" type="QString" value="MM"/>'
-            "</Option></layer></symbol>"
-        )
-    return (
-        "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
-        '<qgis version="3.28.0" styleCategories="Symbology">\n'
-        '<pipe><rasterrenderer type="paletted" band="1" opacity="1" alphaBand="-1">'
-        f"<colorPalette>{''.join(entries)}</colorPalette></rasterrenderer></pipe>\n"
-        '<renderer-v2 type="categorizedSymbol" attr="class_code" enableorderby="0" '
-        'symbollevels="0" forceraster="0">'
-        f"<categories>{''.join(categories)}</categories><symbols>{''.join(symbols)}</symbols>"
-        "</renderer-v2>\n</qgis>\n"
-    )

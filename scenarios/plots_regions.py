@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from mapping.region_files import CLASS_COLOURS
+from mapping.region_style import CLASS_COLOURS
 from perception.files import whole_file
 from perception.records import REGION_CLASSES, Grid, RegionMap
 

@@ -1,8 +1,10 @@
 """Region maps on disk: what is written is read back, and other programs find what they expect."""
 
+import sqlite3
 from xml.etree import ElementTree
 
 import numpy as np
+import pyogrio
 import pyogrio.raw
 import pytest
 import rasterio
@@ -60,14 +62,57 @@ def test_the_raster_is_as_the_contract_has_it(folder):
 
 
 def test_the_polygons_cover_their_cells(folder, result):
-    meta, _, geometry, values = pyogrio.raw.read(folder / "regions.gpkg")
+    meta, _, geometry, values = pyogrio.raw.read(folder / "regions.gpkg", layer="regions")
     columns = dict(zip(meta["fields"], values, strict=True))
     shapes = shapely.from_wkb(geometry)
     np.testing.assert_allclose(shapely.area(shapes), columns["area_m2"])
     assert shapely.is_valid(shapes).all()
     assert set(columns["class"]) <= set(REGION_CLASSES[1:])
     assert {"class_probability", "relief_m", "neighbours", "parent"} <= set(columns)
-    assert (folder / "regions-level-2.gpkg").exists()
+
+
+def test_the_levels_are_a_tree_in_one_file(folder, result):
+    path = folder / "regions.gpkg"
+    names = [name for name, kind in pyogrio.list_layers(path) if kind is not None]
+    assert names == ["regions", "regions-level-2", "graph"]
+    assert pyogrio.read_info(path)["layer_name"] == "regions"  # what a program reads without asking
+    meta, _, _, values = pyogrio.raw.read(path, layer="regions")
+    parent = dict(zip(meta["fields"], values, strict=True))["parent"]
+    np.testing.assert_array_equal(parent, result.parents[0])
+    coarse = read_regions(folder / "regions-level-2.tif")
+    np.testing.assert_array_equal(coarse.edges, result.coarser[0].edges)
+    np.testing.assert_allclose(coarse.table["area_m2"], result.coarser[0].table["area_m2"])
+
+
+def test_the_graph_is_lines_from_region_to_region(folder, result):
+    meta, _, geometry, values = pyogrio.raw.read(folder / "regions.gpkg", layer="graph")
+    columns = dict(zip(meta["fields"], values, strict=True))
+    np.testing.assert_array_equal(
+        np.column_stack([columns["region_a"], columns["region_b"]]), result.regions.edges
+    )
+    np.testing.assert_allclose(columns["border_m"], result.regions.border_m)
+    ends = shapely.get_coordinates(shapely.from_wkb(geometry))[::2]
+    table = result.regions.table
+    np.testing.assert_allclose(ends[:, 0], table["easting_m"][columns["region_a"] - 1])
+
+
+def test_other_programs_find_names_and_colours(folder):
+    """Read back as QGIS and GDAL do: the GeoPackage's table of styles, the raster's side file."""
+    with sqlite3.connect(folder / "regions.gpkg") as file:
+        rows = file.execute(
+            "SELECT f_table_name, f_geometry_column, styleQML, useAsDefault FROM layer_styles"
+        ).fetchall()
+        geometry = dict(file.execute("SELECT table_name, column_name FROM gpkg_geometry_columns"))
+    assert [row[0] for row in rows] == ["regions", "regions-level-2"]
+    for name, column, style, default in rows:
+        assert default
+        assert geometry[name] == column
+        assert ElementTree.fromstring(style.split("\n", 1)[1]).find("renderer-v2") is not None
+    table = ElementTree.parse(folder / "regions.tif.aux.xml").find(".//GDALRasterAttributeTable")
+    named = {int(row[0].text): row[1].text for row in table.findall("Row")}
+    assert named == dict(list(enumerate(REGION_CLASSES))[1:])
+    with rasterio.open(folder / "regions.tif") as source:  # the side file is no obstacle
+        assert source.nodata == 0
 
 
 def test_polygons_of_cells_that_are_not_square_have_the_right_area():
