@@ -60,28 +60,42 @@ def navigate(
             progress("navigation", i + 1, len(nav))
     own = profile_fixes(estimates)
     return Navigation(
-        trajectory=_trajectory(nav, estimates, crs),
+        trajectory=_trajectory(
+            nav,
+            estimates,
+            crs,
+            _places(estimates),
+            np.array([e.covariance_m2 for e in estimates]),
+            np.array([e.protection_m for e in estimates]),
+        ),
         smoothed=smooth(nav, estimates, navigator.wander_m2_s(), crs),
         fixes=tuple(sorted((*own, *fixes), key=lambda f: f.time_s)),
         estimates=tuple(estimates),
     )
 
 
-def _trajectory(nav: NavTable, estimates: Sequence[Estimate], crs: str) -> Trajectory:
-    covariance = np.array([e.covariance_m2 for e in estimates])
+def _trajectory(
+    nav: NavTable,
+    estimates: Sequence[Estimate],
+    crs: str,
+    place: tuple[FloatArray, FloatArray],
+    covariance_m2: FloatArray,
+    protection_m: FloatArray,
+) -> Trajectory:
+    """Rows of the table at `place`, with covariance (n, 2, 2)."""
     return Trajectory(
         time_s=nav.time_s,
-        easting_m=np.array([e.easting_m for e in estimates]),
-        northing_m=np.array([e.northing_m for e in estimates]),
+        easting_m=place[0],
+        northing_m=place[1],
         depth_m=nav.depth_m,
         heading_rad=nav.heading_rad,
-        sigma_easting_m=np.sqrt(covariance[:, 0, 0]),
-        sigma_northing_m=np.sqrt(covariance[:, 1, 1]),
-        cov_en_m2=covariance[:, 0, 1],
+        sigma_easting_m=np.sqrt(covariance_m2[:, 0, 0]),
+        sigma_northing_m=np.sqrt(covariance_m2[:, 1, 1]),
+        cov_en_m2=covariance_m2[:, 0, 1],
         crs=crs,
         utc=nav.utc,
         status=tuple(e.status for e in estimates),
-        protection_m=np.array([e.protection_m for e in estimates]),
+        protection_m=protection_m,
     )
 
 
@@ -149,24 +163,18 @@ def smooth(
     covariance = np.where(
         placed[:, None, None], joint[:, :2, :2], np.array([e.covariance_m2 for e in estimates])
     )
-    return Trajectory(
-        time_s=nav.time_s,
-        easting_m=np.where(
-            placed, nav.easting_m + state[:, 0], np.array([e.easting_m for e in estimates])
-        ),
-        northing_m=np.where(
-            placed, nav.northing_m + state[:, 1], np.array([e.northing_m for e in estimates])
-        ),
-        depth_m=nav.depth_m,
-        heading_rad=nav.heading_rad,
-        sigma_easting_m=np.sqrt(covariance[:, 0, 0]),
-        sigma_northing_m=np.sqrt(covariance[:, 1, 1]),
-        cov_en_m2=covariance[:, 0, 1],
-        crs=crs,
-        utc=nav.utc,
-        status=tuple(e.status for e in estimates),
-        protection_m=np.array([protection_level(c) for c in covariance]),
+    causal = _places(estimates)
+    place = (
+        np.where(placed, nav.easting_m + state[:, 0], causal[0]),
+        np.where(placed, nav.northing_m + state[:, 1], causal[1]),
     )
+    protection = np.array([protection_level(c) for c in covariance])
+    return _trajectory(nav, estimates, crs, place, covariance, protection)
+
+
+def _places(estimates: Sequence[Estimate]) -> tuple[FloatArray, FloatArray]:
+    east, north = np.array([(e.easting_m, e.northing_m) for e in estimates]).T
+    return east, north
 
 
 def _fresh(nav: NavTable) -> BoolArray:

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from localization.measurements import Beam, Measurement, Sensors, default_beams
+from localization.navchecks import check_nav
 from perception.files import existing_file
 from perception.records import FloatArray, InputError
 
@@ -19,13 +20,6 @@ logger = logging.getLogger(__name__)
 
 _NEEDED = ("time_s", "easting_m", "northing_m", "depth_m", "heading_deg")
 _OPTIONAL = ("pitch_deg", "roll_deg", "speed_m_s", "altitude_m")
-# The deepest place of the oceans is 10,935 m: more is another unit.
-_DEEPEST_M = 12_000.0
-# No underwater vehicle makes 50 m/s: more is another unit, or another zone's positions.
-_FASTEST_M_S = 50.0
-# Navigation is logged every few seconds: ten minutes between rows of a vehicle that hardly moves is
-# another unit of time.
-_LONGEST_PAUSE_S = 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,80 +167,3 @@ def _numbers(path: Path, table: pd.DataFrame, name: str) -> FloatArray:
         )
     values[~np.isfinite(values)] = np.nan
     return values
-
-
-def check_nav(nav: NavTable) -> None:
-    """Refuse a table whose values cannot be metres, seconds and degrees, naming the value."""
-    placed = np.isfinite(nav.easting_m) & np.isfinite(nav.northing_m) & np.isfinite(nav.time_s)
-    if placed.sum() < 2:
-        raise InputError(
-            f"{nav.source}: has {int(placed.sum())} row(s) with time and position of {len(nav)}; "
-            "at least 2 are needed"
-        )
-    _check_size(nav, "depth_m", nav.depth_m)
-    for i in range(nav.slant_range_m.shape[1]):
-        _check_size(nav, f"range {i + 1}", nav.slant_range_m[:, i])
-    time = nav.time_s[placed]
-    steps = np.diff(time)
-    backward = int(np.sum(steps < 0))
-    if backward > 0.3 * len(steps) and len(steps) > 3:
-        raise InputError(
-            f"{nav.source}: time_s runs backwards in {backward} of {len(steps)} steps; "
-            "sort the rows by time"
-        )
-    forward = steps > 0
-    if not forward.any():
-        raise InputError(f"{nav.source}: time_s never advances (it is {time[0]:g} throughout)")
-    way = np.hypot(np.diff(nav.easting_m[placed]), np.diff(nav.northing_m[placed]))[forward]
-    speed = float(np.median(way / steps[forward]))
-    if speed > _FASTEST_M_S:
-        raise InputError(
-            f"{nav.source}: positions move at {speed:.4g} m/s (median; the limit is "
-            f"{_FASTEST_M_S:g}); are they in metres and time_s in seconds?"
-        )
-    told = float(np.nanmedian(nav.speed_m_s)) if np.isfinite(nav.speed_m_s).any() else np.nan
-    if told > 0.05 and speed > 0 and not 1 / 300 < speed / told < 300:
-        raise InputError(
-            f"{nav.source}: positions move at {speed:.4g} m/s (median) where speed_m_s says "
-            f"{told:.4g}; is one of time_s, positions and speed_m_s in thousandths?"
-        )
-    pause = float(np.median(steps[forward]))
-    if pause > _LONGEST_PAUSE_S and speed < 0.05:
-        raise InputError(
-            f"{nav.source}: time_s advances by {pause:.4g} s a row (median) while positions move at "
-            f"{speed:.2g} m/s; is it in milliseconds?"
-        )
-
-
-def _check_size(nav: NavTable, name: str, values: FloatArray) -> None:
-    size = np.abs(values[np.isfinite(values)])
-    # A few wild values are outliers, for the filter to reject; half of them are a wrong unit.
-    if size.size and np.median(size) > _DEEPEST_M:
-        raise InputError(
-            f"{nav.source}: {name} is {np.median(size):.4g} m (median), more than any ocean's "
-            f"{_DEEPEST_M:g}; is it in millimetres?"
-        )
-
-
-def check_against_map(nav: NavTable, map_elevation_m: float) -> None:
-    """Refuse depths or ranges a thousand times off: compare the bottom they give with the map's.
-
-    Parameters
-    ----------
-    map_elevation_m : median elevation of the map where the vehicle goes.
-    """
-    if nav.slant_range_m.size == 0 or not np.isfinite(nav.slant_range_m).any():
-        return
-    depth, ranges = nav.depth_m, nav.slant_range_m
-    floor = float(np.nanmedian(depth) + np.nanmedian(ranges))
-    chart = -map_elevation_m
-    if chart > 1.0 and 0 < floor < chart / 300:
-        raise InputError(
-            f"{nav.source}: depth {np.nanmedian(depth):.4g} m and range {np.nanmedian(ranges):.4g} m "
-            f"(medians) put the bottom where the map has {chart:.4g} m; are they in kilometres?"
-        )
-    if chart > 0.01 and floor > 300 * max(chart, 1.0):
-        raise InputError(
-            f"{nav.source}: depth {np.nanmedian(depth):.4g} m and range {np.nanmedian(ranges):.4g} m "
-            f"(medians) put the bottom where the map has {chart:.4g} m; are they in millimetres?"
-        )

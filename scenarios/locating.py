@@ -14,7 +14,8 @@ import numpy as np
 from localization.maperror import assumed_sigma
 from localization.measurements import Sensors, read_sensors
 from localization.mission import Navigation, navigate
-from localization.navfile import NavTable, check_against_map, read_nav
+from localization.navchecks import check_against_map
+from localization.navfile import NavTable, read_nav
 from localization.navigator import CONVERGED, Navigator, NavigatorConfig
 from localization.terrain import TerrainMap, terrain_map
 from mapping.fixes import write_fixes
@@ -59,8 +60,11 @@ def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, A
     prior, sigma_source = prior_with_sigma(options.prior, options.map_sigma_m)
     sensors = None if options.sensors is None else read_sensors(options.sensors)
     survey = open_side_scan(options.swath, prior.crs, progress) if options.swath else None
+    # Files have headings from true north; inside they are from grid north.
+    told = None
     if options.nav is not None:
-        nav = on_grid(read_nav(options.nav, sensors), prior.crs)
+        read = read_nav(options.nav, sensors)
+        nav, told = on_grid(read, prior.crs), read.heading_rad
     elif survey is not None:
         nav = nav_of_survey(survey, sensors or Sensors())
     else:
@@ -69,7 +73,7 @@ def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, A
         terrain = terrain_map(prior, options.map_error_length_m, reach(nav))
     except NoOverlapError as error:
         raise NoOverlapError(f"{nav.source} on {options.prior}: {error}") from error
-    check_against_map(nav, float(np.nanmedian(terrain.height_m)))
+    check_against_map(nav, float(np.nanmedian(terrain.height_m)), terrain.relief_m)
     navigator = Navigator(
         terrain,
         nav.sensors,
@@ -81,8 +85,6 @@ def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, A
     metrics = summary(result, nav, terrain)
     metrics["map_sigma_source"] = sigma_source
     metrics["seconds"] = round(time.perf_counter() - began, 3)
-    # Files have headings as the input did.
-    told = None if options.nav is None else read_nav(options.nav, sensors).heading_rad
     for name, track in (
         ("trajectory", result.trajectory),
         ("trajectory-smoothed", result.smoothed),

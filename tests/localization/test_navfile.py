@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from localization.measurements import read_sensors
-from localization.navfile import check_against_map, nav_table, read_nav
+from localization.navchecks import check_against_map
+from localization.navfile import nav_table, read_nav
 from perception.records import FloatArray, InputError
 
 
@@ -87,12 +88,37 @@ def test_time_in_milliseconds_is_refused_where_the_rows_tell() -> None:
         nav_table(columns)
 
 
-def test_kilometres_are_refused_against_the_map() -> None:
+@pytest.mark.parametrize(
+    ("names", "factor", "words"),
+    [
+        (("depth_m", "beam"), 1e-3, "depth_m is 0.04.* and the ranges .*kilometres"),
+        (("depth_m",), 1e-3, "depth_m is 0.04.*kilometres"),
+        (("beam",), 1e-3, "the ranges are 0.0.*kilometres"),
+        (("beam",), 100.0, ""),
+    ],
+)
+def test_the_map_tells_a_wrong_unit_from_a_wrong_place(
+    names: tuple[str, ...], factor: float, words: str
+) -> None:
     columns = columns_of()
-    for name in ("depth_m", "beam1_m", "beam2_m", "beam3_m", "beam4_m"):
-        columns[name] = columns[name] / 1000
-    with pytest.raises(InputError, match="kilometres"):
-        check_against_map(nav_table(columns), -100.0)
+    for name in columns:
+        if name.startswith(names):
+            columns[name] = columns[name] * factor
+    if not words:  # no unit makes these meet the map
+        check_against_map(nav_table(columns), -100.0, 5.0)
+        return
+    with pytest.raises(InputError, match=words):
+        check_against_map(nav_table(columns), -100.0, 5.0)
+
+
+def test_headings_in_radians_are_refused_where_the_course_tells() -> None:
+    columns = columns_of()
+    turning = np.linspace(0.0, 4.0, 20)
+    columns["easting_m"] = np.cumsum(4.5 * np.sin(turning))
+    columns["northing_m"] = np.cumsum(4.5 * np.cos(turning))
+    nav_table({**columns, "heading_deg": np.degrees(turning)})
+    with pytest.raises(InputError, match="radians"):
+        nav_table({**columns, "heading_deg": turning})
 
 
 def test_rows_in_reverse_are_refused() -> None:
