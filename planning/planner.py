@@ -38,6 +38,8 @@ class PlanConfig:
     Attributes
     ----------
     planner : OMPL's planner: rrtstar, informed, sorrt, bitstar, fmt, or none.
+    space : that it plans in: corridor (around the best guide), or without a guide depth, altitude,
+        dubins or owen.
     iterations : of OMPL; on iterations, not on time, so that runs repeat; None about a second's.
     seed : of OMPL.
     risk : probability that the floor is broken anywhere along the route.
@@ -47,6 +49,7 @@ class PlanConfig:
     """
 
     planner: str = "bitstar"
+    space: str = "corridor"
     iterations: int | None = None
     seed: int = 0
     risk: float = 0.01
@@ -292,16 +295,33 @@ def _polished(surface: Surface, guide: FloatArray, source: str) -> Candidate:
 def _ompl(
     surface: Surface, seed: Candidate, ends: FloatArray, config: PlanConfig
 ) -> FloatArray | None:
-    """Return the path that OMPL finds in the corridor around the best candidate so far."""
-    from planning.ompl_planner import plan_in_corridor
+    """Return the path that OMPL finds: in the corridor around the best candidate so far, or on its own."""
+    from planning.ompl_planner import plan_in_corridor, plan_unguided
 
-    thin = thinned(surface)
-    to_go = cost_to_go(thin, thin.node((ends[1, 0], ends[1, 1])))
-    radius = surface.limits.turn_radius_m * RADIUS_RESERVE
-    guide = waypoints(seed.points, radius, 2.0 * min(surface.cell_m))
-    corridor = make_corridor(surface, guide, to_go, thin.cell_m, thin.shift_m)
-    found = plan_in_corridor(corridor, config.planner, config.seed, config.iterations)
-    return None if found is None else corridor.polyline(found.states)
+    if config.space != "corridor":
+        headings = end_headings(surface, seed.points)
+        found = plan_unguided(
+            surface, ends, headings, config.space, config.planner, config.seed, config.iterations
+        )
+    else:
+        thin = thinned(surface)
+        to_go = cost_to_go(thin, thin.node((ends[1, 0], ends[1, 1])))
+        radius = surface.limits.turn_radius_m * RADIUS_RESERVE
+        guide = waypoints(seed.points, radius, 2.0 * min(surface.cell_m))
+        corridor = make_corridor(surface, guide, to_go, thin.cell_m, thin.shift_m)
+        found = plan_in_corridor(corridor, config.planner, config.seed, config.iterations)
+    return None if found is None else found.points
+
+
+def end_headings(surface: Surface, points: FloatArray) -> tuple[float, float]:
+    """Return the headings (rad) at the ends: those asked for, else those of a guide."""
+    legs = np.diff(points, axis=0)[[0, -1]]
+    asked = (surface.limits.start_heading_deg, surface.limits.goal_heading_deg)
+    free = [math.atan2(leg[0], -leg[1]) for leg in legs]
+    start, goal = (
+        math.radians(a) if math.isfinite(a) else f for a, f in zip(asked, free, strict=True)
+    )
+    return start, goal
 
 
 # Height in reserve, and samples per cell, of a second polish for what the proof refused.

@@ -47,6 +47,7 @@ class Given:
     old_route: Path | None
     travelled: float
     planner: str
+    space: str
     seed: int
 
 

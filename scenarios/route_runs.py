@@ -73,7 +73,7 @@ def _planned(run: Run) -> tuple[Plan, dict[str, Any]]:
     assert given.start is not None and given.goal is not None
     asked = read_asked(given, run.limits, run.progress)
     more = dict(asked.more)
-    config = PlanConfig(planner=given.planner, seed=given.seed)
+    config = PlanConfig(given.planner, given.space, seed=given.seed)
     stops = [given.start, *given.via, given.goal]
     order = list(range(len(stops)))
     if asked.full is not None:

@@ -20,6 +20,7 @@ from scenarios.commands.console import (
 from scenarios.route_inputs import Given
 
 PLANNERS = ("bitstar", "rrtstar", "informed", "sorrt", "fmt", "none")
+SPACES = ("corridor", "altitude", "depth", "dubins", "owen")
 
 
 class Position(click.ParamType):  # type: ignore[type-arg]
@@ -85,6 +86,13 @@ class Position(click.ParamType):  # type: ignore[type-arg]
 @click.option("--replan", "old_route", type=click.Path(path_type=Path), help="route.csv under way.")
 @click.option("--travelled", type=float, default=0.0, help="Metres of it behind the vehicle.")
 @click.option("--planner", type=click.Choice(PLANNERS), default="bitstar", show_default=True)
+@click.option(
+    "--space",
+    type=click.Choice(SPACES),
+    default="corridor",
+    show_default=True,
+    help="That OMPL plans in: along the best guide, or without one.",
+)
 @click.option("--seed", type=int, default=0, show_default=True, help="Of OMPL.")
 @click.option("--picture/--no-picture", default=True, show_default=True, help="Draw route.png.")
 @common_options
@@ -135,6 +143,8 @@ def _refuse_mixed(given: Given) -> None:
         raise click.UsageError(
             "give --start E,N and --goal E,N (or --survey AREA, or --replan ROUTE)"
         )
+    if given.planner == "fmt" and given.space != "corridor":
+        raise click.UsageError("--planner fmt plans in --space corridor only")
     if given.seed < 0:
         raise click.UsageError(f"--seed must be 0 or more, got {given.seed}")
     if not 0 < given.risk < 1:
