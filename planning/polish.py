@@ -9,22 +9,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numba import njit
 
 from perception.records import FloatArray
-from planning.curve import sample_curve
-from planning.profile import EXCESS_PRICE, make_work, path_cost
+from planning.descent import curve_cost, descend
+from planning.profile import EXCESS_PRICE, make_work
 from planning.surface import Surface
 
-# Price per metre by which the tangents of an arc do not fit: above what any shortcut can save.
-_OVERLAP_PRICE = 300.0
 # From round to round the price of breaking the ceiling rises by the inverse of this: at first a path may
 # cut through what a harder price would fence off, and settles into the better valley.
 _EASE = 0.25
-# Least shift that is tried, in samples: a twentieth of a cell changes no cost that matters.
-_FINEST = 0.05
 # Pitch and radius are planned a little inside the limits: printed digits must keep them too.
 PITCH_RESERVE = 0.995
 RADIUS_RESERVE = 1.01
@@ -106,11 +102,8 @@ def evaluate(
 ) -> Candidate:
     """Cost a control polygon as it stands, sampled `step` apart (a cell without)."""
     step = min(surface.cell_m) if step is None else step
-    cost, breach = _whole_cost(
-        surface.stack, surface.cell_m[0], surface.cell_m[1], points,
-        surface.limits.turn_radius_m * RADIUS_RESERVE, step,
-        rules_of(surface) if rules is None else rules, *_scratch(points, step),
-    )  # fmt: skip
+    rules = rules_of(surface) if rules is None else rules
+    cost, breach = curve_cost(_scene(surface, points, step, rules), points, 0, len(points) - 1)
     return Candidate(points, float(cost), float(breach), source)
 
 
@@ -145,11 +138,8 @@ def polish(
         trial[8] = EXCESS_PRICE * _EASE ** (rounds - 1 - turn)
         if turn > 0:
             points, locked = _lock_ends(surface, respace(points, spacing))
-        _descend(
-            surface.stack, surface.cell_m[0], surface.cell_m[1], points, *locked,
-            surface.limits.turn_radius_m * RADIUS_RESERVE, step, trial,
-            *_scratch(points, step), sweeps, _margin_m(surface),
-        )  # fmt: skip
+        scene = _scene(surface, points, step, trial)
+        descend(scene, points, *locked, sweeps, _margin_m(surface))
         found = evaluate(surface, points.copy(), source, step, rules)
         if found.cost < best.cost or (best.breach > 0 and found.breach == 0):
             best = found
@@ -179,139 +169,13 @@ def _margin_m(surface: Surface) -> float:
     return min(band / slope, 12.0 * band) + 4.0 * max(surface.cell_m)
 
 
-def _scratch(points: FloatArray, step: float) -> tuple[FloatArray, ...]:
+def _scene(surface: Surface, points: FloatArray, step: float, rules: FloatArray) -> tuple[Any, ...]:
+    """Return what the kernels need to cost a curve, scratch included."""
     length = float(np.hypot(*np.diff(points, axis=0).T).sum())
     # A path may grow while it is moved; twice its samples leaves room, and what does not fit is refused.
     n = int(2.0 * length / step) + 4 * len(points) + 256
-    work, hull = make_work(n)
-    return np.empty(n), np.empty(n), work, hull
-
-
-@njit(cache=True, nogil=True)
-def _whole_cost(stack, width, height, points, radius, step, rules, px, py, work, hull):  # type: ignore[no-untyped-def]
-    n, overlap = sample_curve(points, 0, len(points) - 1, radius, step, px, py)
-    if n < 0:
-        return np.inf, np.inf
-    cost, breach = path_cost(stack, width, height, px, py, n, rules, work, hull)
-    return cost + _OVERLAP_PRICE * overlap, breach + overlap
-
-
-@njit(cache=True)
-def _window_cost(  # type: ignore[no-untyped-def]
-    stack, width, height, points, first, last, radius, step, rules, px, py, work, hull
-):
-    n, overlap = sample_curve(points, first, last, radius, step, px, py)
-    if n < 0:
-        return np.inf
-    cost, _ = path_cost(stack, width, height, px, py, n, rules, work, hull)
-    return cost + _OVERLAP_PRICE * overlap
-
-
-@njit(cache=True, nogil=True)
-def _descend(  # type: ignore[no-untyped-def]
-    stack,
-    width,
-    height,
-    points,
-    head,
-    tail,
-    radius,
-    step,
-    rules,
-    px,
-    py,
-    work,
-    hull,
-    sweeps,
-    margin,
-):
-    n = len(points)
-    if n < 3:
-        return
-    spacing = math.hypot(points[1, 0] - points[0, 0], points[1, 1] - points[0, 1])
-    spacing = max(spacing, step)
-    beyond = math.ceil(margin / spacing) + 2
-    widths = np.array([16, 8, 4, 2, 1])
-    finest = _FINEST * step
-    delta = np.empty((len(widths), n))
-    for level in range(len(widths)):
-        delta[level, :] = min(0.25 * spacing * widths[level], 8.0 * spacing)
-    saved = np.empty((n, 2))
-    for sweep in range(sweeps):
-        gained, total = 0.0, 0.0
-        for level in range(len(widths)):
-            half = widths[level]
-            if half > 1 and half > n // 2:
-                continue
-            stride = max(1, half // 2)
-            for centre in range(head + sweep % stride, n - tail, stride):
-                d = delta[level, centre]
-                if d < finest:
-                    # Rested; look again now and then, since its neighbours move.
-                    if sweep % 4 != 3:
-                        continue
-                    d = 4.0 * finest
-                j0 = max(head, centre - half + 1)
-                j1 = min(n - 1 - tail, centre + half - 1)
-                first, last = max(0, j0 - 1 - beyond), min(n - 1, j1 + 1 + beyond)
-                old = _window_cost(
-                    stack,
-                    width,
-                    height,
-                    points,
-                    first,
-                    last,
-                    radius,
-                    step,
-                    rules,
-                    px,
-                    py,
-                    work,
-                    hull,
-                )
-                tx = points[centre + 1, 0] - points[centre - 1, 0]
-                ty = points[centre + 1, 1] - points[centre - 1, 1]
-                norm = max(math.hypot(tx, ty), 1e-9)
-                nx, ny = -ty / norm, tx / norm
-                if half <= 2 and sweep % 3 == 2:
-                    # Along the path too: room for an arc is gained by shifting its corner.
-                    nx, ny = tx / norm, ty / norm
-                for j in range(j0, j1 + 1):
-                    saved[j, 0], saved[j, 1] = points[j, 0], points[j, 1]
-                better = False
-                for sign in (1.0, -1.0):
-                    for j in range(j0, j1 + 1):
-                        share = sign * d * (1.0 - abs(j - centre) / half)
-                        points[j, 0] = saved[j, 0] + share * nx
-                        points[j, 1] = saved[j, 1] + share * ny
-                    new = _window_cost(
-                        stack,
-                        width,
-                        height,
-                        points,
-                        first,
-                        last,
-                        radius,
-                        step,
-                        rules,
-                        px,
-                        py,
-                        work,
-                        hull,
-                    )
-                    if new < old - 1e-7:
-                        better = True
-                        gained += old - new
-                        break
-                if better:
-                    delta[level, centre] = min(2.0 * d, 8.0 * spacing)
-                else:
-                    for j in range(j0, j1 + 1):
-                        points[j, 0], points[j, 1] = saved[j, 0], saved[j, 1]
-                    delta[level, centre] = 0.4 * d
-        if sweep % 4 == 3:
-            n_s, _ = sample_curve(points, 0, n - 1, radius, step, px, py)
-            if n_s > 0:
-                total, _ = path_cost(stack, width, height, px, py, n_s, rules, work, hull)
-            if gained < 2e-6 * total:
-                break
+    return (
+        surface.stack, surface.cell_m[0], surface.cell_m[1],
+        surface.limits.turn_radius_m * RADIUS_RESERVE, step, rules,
+        np.empty(n), np.empty(n), *make_work(n),
+    )  # fmt: skip
