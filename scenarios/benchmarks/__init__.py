@@ -28,6 +28,14 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
         "Position from terrain: error, bound, honesty, time per update, peers.",
     ),
     "planning": ("planning", "Routes: cost against the grid search, parts switched off, peers."),
+    "planning-grid": (
+        "planning_grid",
+        "The grid stage on 4,000 x 4,000 cells, beside fast marching.",
+    ),
+    "planning-seeds": (
+        "planning_seeds",
+        "Fifty random routes by the command, checked from the files.",
+    ),
     "regions": (
         "regions",
         "H-K regions: signs under noise and seconds, beside fixed scales and peers",
