@@ -15,7 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from perception.box_fit import box_derivatives
 from perception.curvature import Curvature, Operator, curvature_of
+from perception.noise import independent_noise
 from perception.records import FloatArray, Grid
 from perception.scale import smooth, upsample
 
@@ -24,12 +26,33 @@ from perception.scale import smooth, upsample
 _USEFUL_CELLS = 144
 # With fewer regions than this nobody asks for fewer.
 _FEW = 30
+# Cells from one node of the noise map to the next.
+_STEP = 8
 # No map is thinned below this many cells on its longer side.
 _LEAST_SIDE = 32
 # Above this many cells the level is chosen on tiles of so many cells a side, where most is known.
 _WHOLE_CELLS = 600_000
 _TILE = 320
 _TILES = 4
+
+
+def box_curvature(grid: Grid, window_m: float) -> Curvature:
+    """Return H, K and their errors of the quadratic fitted over a box `window_m` wide about each cell."""
+    # No box need be larger than the map, and none can be smaller than three cells.
+    half = (
+        min(max(round(0.5 * window_m / grid.cell_north_m - 0.5), 1), grid.shape[0]),
+        min(max(round(0.5 * window_m / grid.cell_m - 0.5), 1), grid.shape[1]),
+    )
+    derivatives, gain = box_derivatives(grid.elevation_m, grid.cell_m, grid.cell_north_m, half)
+    noise = upsample(independent_noise(grid.elevation_m, grid.sigma_m, _STEP), _STEP, grid.shape)
+    mean, gauss, sigma_h, sigma_k = curvature_of(derivatives, gain, noise.astype(np.float64))
+    # The Gaussian sigma that leaves the same noise in the second derivatives.
+    with np.errstate(divide="ignore"):
+        noise_gain = np.sqrt(np.maximum(gain.rr * gain.tt, 0.0))
+        scale = (3 * grid.cell_m * grid.cell_north_m / (16 * np.pi * noise_gain)) ** (1 / 6)
+    # A box of one row has no curvature across itself and no noise in it.
+    scale[~np.isfinite(scale) & ~np.isnan(mean)] = 0.5 * window_m
+    return Curvature(mean, gauss, sigma_h, sigma_k, scale, noise)
 
 
 def curvature_at(

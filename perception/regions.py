@@ -28,7 +28,7 @@ from perception.records import (
     silent,
 )
 from perception.region_classes import classify
-from perception.region_detail import candidates, curvature_at, tiles, useful
+from perception.region_detail import box_curvature, candidates, curvature_at, tiles, useful
 from perception.region_graph import region_table
 from perception.region_labels import (
     COUNT,
@@ -58,6 +58,8 @@ class RegionConfig:
     scale_m : smoothing (Gaussian sigma or equivalent) for the whole map; None chooses it per cell.
     detail_m : least scale of the classes, m; 0 the finest that the noise allows; None the finest that
         gives regions of a useful size. H and K are not touched by it. Not used with `scale_m`.
+    window_m : instead of all that, one quadratic by least squares over a box of this width about each
+        cell, unweighted; a box of three cells is the classical 3 x 3 fit.
     operator : derivatives by central differences or by a 3 x 3 least-squares fit.
     k_sigma : H or K within this many of its sigma of zero counts as zero.
     least_H_per_m, least_K_per_m2 : tolerances never fall below these.
@@ -70,6 +72,7 @@ class RegionConfig:
 
     scale_m: float | None = None
     detail_m: float | None = None
+    window_m: float | None = None
     operator: Operator = "difference"
     k_sigma: float = 2.0
     least_H_per_m: float = 0.0
@@ -84,6 +87,10 @@ class RegionConfig:
             raise InputError(f"the scale must be zero or more metres, got {self.scale_m}")
         if self.detail_m is not None and not (np.isfinite(self.detail_m) and self.detail_m >= 0):
             raise InputError(f"the detail must be zero or more metres, got {self.detail_m}")
+        if self.window_m is not None and not (np.isfinite(self.window_m) and self.window_m > 0):
+            raise InputError(f"the window must be some metres wide, got {self.window_m}")
+        if self.window_m is not None and self.scale_m is not None:
+            raise InputError("a window and a scale exclude each other; give one of them")
         if self.levels < 1:
             raise InputError(f"levels must be at least 1, got {self.levels}")
 
@@ -133,7 +140,10 @@ def segment(
     progress("regions", 0, steps)
     detail_m = _detail(grid, config)
     progress("regions", 1, steps)
-    curvature = curvature_at(grid, config.scale_m, 0.0, config.operator)
+    if config.window_m is None:
+        curvature = curvature_at(grid, config.scale_m, 0.0, config.operator)
+    else:
+        curvature = box_curvature(grid, config.window_m)
     progress("regions", 2, steps)
     read = curvature
     if detail_m > 0:
@@ -157,7 +167,7 @@ def segment(
 
 def _detail(grid: Grid, config: RegionConfig) -> float:
     """Return the least scale the classes are read at, m: the finest that gives regions of a useful size."""
-    if config.scale_m is not None:
+    if config.scale_m is not None or config.window_m is not None:
         return 0.0
     if config.detail_m is not None:
         return config.detail_m

@@ -17,7 +17,9 @@ from scenarios.commands.console import (
 )
 
 if TYPE_CHECKING:
-    from perception.regions import Segmentation
+    from perception.curvature import Operator
+    from perception.records import Grid
+    from perception.regions import RegionConfig, Segmentation
 
 
 @click.command()
@@ -31,6 +33,11 @@ if TYPE_CHECKING:
 )
 @click.option("--detail", "detail_m", type=float,
               help="Least scale of the classes, m; 0 the finest, else chosen to give regions of use.")  # fmt: skip
+@click.option("--window", "window_m", type=float,
+              help="Fit a quadratic over boxes of this width, m, instead of smoothing.")  # fmt: skip
+@click.option("--method", type=click.Choice(["auto", "difference", "least-squares", "box"]),
+              default="auto", show_default=True,
+              help="Scale chosen per cell, bare 3 x 3 cells (two ways), or boxes (--window).")  # fmt: skip
 @click.option("--map-sigma", "map_sigma_m", type=float, help="1-sigma of the heights, m.")
 @click.option("--levels", type=click.IntRange(1, 8), default=1, show_default=True,
               help="Levels of detail; each coarser one doubles the scale.")  # fmt: skip
@@ -42,6 +49,8 @@ def command(
     out: Path,
     scale_m: float | None,
     detail_m: float | None,
+    window_m: float | None,
+    method: str,
     map_sigma_m: float | None,
     levels: int,
     objects_path: Path | None,
@@ -66,15 +75,15 @@ def command(
     from mapping.region_files import write_segmentation
     from perception.background import lift_objects
     from perception.records import InputError
-    from perception.regions import RegionConfig, segment
+    from perception.regions import segment
     from scenarios.outputs import write_metrics
     from scenarios.plots_regions import plot_legend, plot_regions
 
     set_verbosity(quiet, verbose)
     if map_sigma_m is not None and not map_sigma_m >= 0:
         raise InputError(f"--map-sigma must be zero or more metres, got {map_sigma_m}")
-    config = RegionConfig(scale_m=scale_m, detail_m=detail_m, levels=levels)
     grid = read_map(map_path, map_sigma_m)
+    config = _config(grid, method, scale_m, detail_m, window_m, levels)
     prepare_out(out)
     start = perf_counter()
     objects = None if objects_path is None else read_objects(objects_path, grid)
@@ -96,6 +105,29 @@ def command(
     write_metrics(out, metrics, {**asdict(config), "map": str(map_path)})
     if not quiet:
         _print(result, metrics, out)
+
+
+def _config(
+    grid: Grid,
+    method: str,
+    scale_m: float | None,
+    detail_m: float | None,
+    window_m: float | None,
+    levels: int,
+) -> RegionConfig:
+    """Turn the method's name into what it stands for: a window of three cells, or no smoothing."""
+    from perception.records import InputError
+    from perception.regions import RegionConfig
+
+    if window_m is not None and method not in ("auto", "box"):
+        raise InputError(f"--window goes with --method box, not {method}; leave one of them out")
+    if method == "box" and window_m is None:
+        raise InputError("--method box needs a --window in metres")
+    if method in ("auto", "box"):
+        return RegionConfig(scale_m=scale_m, detail_m=detail_m, window_m=window_m, levels=levels)
+    operator: Operator = "difference" if method == "difference" else "least-squares"
+    # Three by three cells as they are, unless a scale asks for smoothing before.
+    return RegionConfig(scale_m=scale_m or 0.0, operator=operator, levels=levels)
 
 
 def _metrics(result: Segmentation, seconds: float) -> dict[str, Any]:

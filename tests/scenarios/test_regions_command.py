@@ -62,6 +62,40 @@ def test_odd_maps_give_a_clear_result(tmp_path, z, scale):
         assert (source.read(1) > 0).all()
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--method", "difference"),
+        ("--method", "least-squares"),
+        ("--window", 9),
+        ("--method", "box", "--window", 5000),
+        ("--detail", 0),
+        ("--detail", 1e6),
+    ],
+    ids=str,
+)
+def test_every_method_gives_a_whole_result(tmp_path, options):
+    path = write(tmp_path / "map.tif", hill(40))
+    done = run(path, "--out", tmp_path / "out", *options, "--levels", 2)
+    assert done.exit_code == 0, (done.output, done.exception)
+    with rasterio.open(tmp_path / "out" / "regions.tif") as source:
+        assert (source.read(1) > 0).all()
+    with rasterio.open(tmp_path / "out" / "curvature.tif") as source:
+        bands = source.read()
+    assert np.isfinite(bands).all()
+    assert bands[0, 12:28, 12:28].mean() < 0  # a summit by any method, noise averaged out
+
+
+def test_a_window_is_what_the_textbook_fit_gives(tmp_path):
+    z = hill(40)
+    path = write(tmp_path / "map.tif", z)
+    run(path, "--out", tmp_path / "out", "--window", 3)
+    run(path, "--out", tmp_path / "same", "--method", "least-squares")
+    found = [rasterio.open(tmp_path / name / "curvature.tif").read() for name in ("out", "same")]
+    inner = np.s_[:2, 1:-1, 1:-1]
+    np.testing.assert_allclose(found[0][inner], found[1][inner], rtol=1e-4, atol=1e-6)
+
+
 def test_an_odd_sigma_band_is_no_obstacle(tmp_path):
     sigma = np.full((64, 64), 0.03)
     sigma[:10] = 0
@@ -94,6 +128,12 @@ def test_degrees_are_refused_with_the_way_out(tmp_path):
 def test_impossible_options_and_missing_files_are_refused(tmp_path):
     path = write(tmp_path / "map.tif", hill(32))
     assert "scale" in refused(path, "--out", tmp_path / "out", "--scale", -2)
+    out = tmp_path / "out"
+    assert "exclude" in refused(path, "--out", out, "--scale", 2, "--window", 5)
+    assert "needs a --window" in refused(path, "--out", out, "--method", "box")
+    assert "goes with" in refused(path, "--out", out, "--method", "difference", "--window", 5)
+    assert "window" in refused(path, "--out", out, "--window", -5)
+    assert "detail" in refused(path, "--out", out, "--detail", -5)
     assert "no such file" in refused(tmp_path / "none.tif", "--out", tmp_path / "out")
     missing = tmp_path / "objects.gpkg"
     assert "objects.gpkg" in refused(path, "--out", tmp_path / "out", "--objects", missing)
