@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import rasterio
 import rasterio.shutil
+from rasterio._err import CPLE_BaseError
 from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 from rasterio.windows import Window
@@ -23,6 +24,8 @@ from perception.records import Grid, InputError, Progress, silent
 _CACHE_MB = 256
 
 Slices = tuple[slice, slice]
+# A disk that fills up is told by GDAL's own exception where rasterio does not turn it into one of its own.
+RASTER_ERRORS = (RasterioError, CPLE_BaseError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +131,7 @@ def write_cog(
                 overview_resampling="average", bigtiff="if_safer", num_threads="2",
             )  # fmt: skip
             progress("writing the raster", 1, 1)
-    except RasterioError as error:
+    except RASTER_ERRORS as error:
         raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from error
     finally:
         draft.unlink(missing_ok=True)

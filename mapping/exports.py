@@ -15,9 +15,9 @@ import numpy.typing as npt
 import rasterio
 import rasterio.shutil
 from pyproj import CRS
-from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
+from mapping.cog import RASTER_ERRORS
 from perception.files import existing_file, whole_file
 from perception.records import InputError
 
@@ -62,7 +62,7 @@ def export_map(source: Path, target: Path) -> None:
                 _write_by_gdal(temporary, raster, target.suffix)
                 if temporary.with_suffix(".prj").exists():
                     temporary.with_suffix(".prj").replace(target.with_suffix(".prj"))
-    except (RasterioError, RuntimeError) as error:
+    except (*RASTER_ERRORS, RuntimeError) as error:
         # netCDF4 tells a full disk as a RuntimeError of its library.
         raise InputError(f"{target}: cannot be written ({error}); is the disk full?") from error
 

@@ -17,7 +17,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from mapping.cog import Statistics
+from mapping.cog import RASTER_ERRORS, Statistics
 from perception.files import existing_file, whole_file
 from perception.records import FloatArray, Grid, InputError
 
@@ -327,5 +327,5 @@ def write_bands(
                         statistics.add(band)
                         target.update_tags(index, **statistics.tags(rows * cols))
                 target.update_tags(**dict(tags or {}))
-        except RasterioError as error:
+        except RASTER_ERRORS as error:
             raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from error

@@ -79,7 +79,10 @@ def write_strip(path: Path, strip: ElevationStrip, utc: bool = True) -> None:
         name: squeezed for name, (dimensions, *_) in _VARIABLES.items() if len(dimensions) == 2
     }
     with whole_file(path) as temporary:
-        data.to_netcdf(temporary, engine="netcdf4", encoding=encoding)
+        try:
+            data.to_netcdf(temporary, engine="netcdf4", encoding=encoding)
+        except RuntimeError as error:  # netCDF's word for a full disk
+            raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from error
 
 
 def read_strip(path: Path) -> ElevationStrip:
