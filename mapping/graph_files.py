@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ class PoseGraph:
     key : (v,) number of each vertex; `pose` (v, 3) x, y, angle or (v, 7) x, y, z, qx, qy, qz, qw.
     edge : (e, 2) keys from and to; `measured` (e, 3 or 7) pose of the second in the frame of the first.
     information : (e, 3, 3) or (e, 6, 6) inverse covariance, translation before rotation.
+    fixed : keys of vertices that are held where they are.
     """
 
     key: IntArray
@@ -35,6 +36,7 @@ class PoseGraph:
     edge: IntArray
     measured: FloatArray
     information: FloatArray
+    fixed: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def planar(self) -> bool:
@@ -51,11 +53,14 @@ def read_g2o(path: Path) -> PoseGraph:
     """
     path = existing_file(path)
     rows: dict[str, list[list[float]]] = {tag: [] for tag in _TAGS}
+    fixed: list[int] = []
     with path.open(encoding="utf-8", errors="replace") as stream:
         for number, line in enumerate(stream, start=1):
             tag, *words = line.split() or [""]
             if tag in _TAGS:
                 rows[tag].append(_numbers(path, number, tag, words))
+            elif tag == "FIX":
+                fixed += [int(word) for word in words if word.isdigit()]
     planar = bool(rows["EDGE_SE2"])
     if planar and rows["EDGE_SE3:QUAT"]:
         raise InputError(f"{path}: mixes two and three dimensions; split it into two files")
@@ -72,6 +77,7 @@ def read_g2o(path: Path) -> PoseGraph:
         edge=e[:, :2].astype(np.int64),
         measured=e[:, 2 : 2 + width],
         information=_symmetric(e[:, 2 + width :], size),
+        fixed=np.array(fixed, np.int64),
     )
 
 
@@ -107,6 +113,7 @@ def write_g2o(path: Path, graph: PoseGraph) -> None:
         f"VERTEX_{suffix} {key} {_text(pose)}"
         for key, pose in zip(graph.key.tolist(), graph.pose.tolist(), strict=True)
     ]
+    lines += [f"FIX {key}" for key in graph.fixed.tolist()]
     for (a, b), measured, information in zip(
         graph.edge.tolist(),
         graph.measured.tolist(),

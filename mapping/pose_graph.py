@@ -101,6 +101,7 @@ class Solution:
         constant of the data; NaN where it cannot be had.
     error_before, error_after : the graph's error (half a chi-square) over what was used.
     indeterminate, worsened : the graph does not determine the answer; the answer is no better.
+    config : what was assumed.
     """
 
     correction_m: FloatArray
@@ -117,6 +118,7 @@ class Solution:
     error_after: float
     indeterminate: bool
     worsened: bool
+    config: GraphConfig
 
 
 def perpendicular(vector: FloatArray) -> FloatArray:
@@ -144,7 +146,7 @@ def solve(
     if robust and doubtful:
         used = _consistent(graph, values, doubtful, config)
     kept = _without(graph, [f for f, ok in zip(doubtful, used, strict=True) if not ok])
-    result = gtsam.GaussNewtonOptimizer(kept, values, _gauss_newton()).optimize()
+    result = gtsam.GaussNewtonOptimizer(kept, values, gauss_newton()).optimize()
     before, after = kept.error(values), kept.error(result)
     marginals, indeterminate = _marginals(kept, result)
     n_links = len(links)
@@ -179,6 +181,7 @@ def solve(
         error_after=after,
         indeterminate=indeterminate,
         worsened=bool(after > before * (1 + 1e-9) + 1e-9),
+        config=config,
     )
 
 
@@ -299,7 +302,7 @@ def _linear(*terms: Any) -> Any:
 
 def _consistent(graph: Any, values: Any, doubtful: list[int], config: GraphConfig) -> BoolArray:
     """Return which doubtful factors agree with the rest (truncated least squares by GNC)."""
-    parameters = gtsam.GncGaussNewtonParams(_gauss_newton())
+    parameters = gtsam.GncGaussNewtonParams(gauss_newton())
     # Odometry and ties are linear factors of one noise each, which GNC then leaves alone.
     parameters.setAllowNonNoiseModelFactors(True)
     doubted = set(doubtful)
@@ -311,7 +314,8 @@ def _consistent(graph: Any, values: Any, doubtful: list[int], config: GraphConfi
     return np.asarray(weights[doubtful] > 0.5)
 
 
-def _gauss_newton() -> Any:
+def gauss_newton() -> Any:
+    """Return the parameters of the solver."""
     parameters = gtsam.GaussNewtonParams()
     # Cholesky squares the condition number, and weights of 1 cm stand beside some of 300 m.
     parameters.setLinearSolverType("MULTIFRONTAL_QR")

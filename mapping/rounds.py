@@ -160,7 +160,7 @@ def _link(
     offsets, ground = [], []
     # The mean of a random walk over the window against its value in the middle: q^2 L / 12, each pass.
     bend = 2.0 * config.drift_m_per_sqrt_km**2 / 1000.0 * window.side_m / 12.0
-    covariance = result.covariance_m2 + bend * np.eye(2)
+    covariance = result.covariance_m2 + (bend + _LEFT_OVER_M**2) * np.eye(2)
     for k in ends:
         strip = int(keyframes.strip[k])
         position = np.array([keyframes.easting_m[k], keyframes.northing_m[k]])
@@ -179,10 +179,10 @@ def _link(
     )
 
 
-# The part of the floor's unevenness along a track that stays unknown beside it; and the part of a floor's
-# sigma that is left of it in the mean over a square.
+# The part of the floor's unevenness along a track that stays unknown beside it.
 _UNKNOWN_RELIEF = 0.6
-_COMMON_TO_SQUARE = 0.6
+# What the width of beams and unmeasured rocking leave of any registration, 1-sigma an axis.
+_LEFT_OVER_M = 0.2
 
 
 def _typical_sigma(floor: Grid, window: Window) -> float | None:
@@ -198,7 +198,7 @@ def _typical_sigma(floor: Grid, window: Window) -> float | None:
     cols = slice(max(int(col[0]), 0), max(int(col[1]) + 1, 0))
     sigma = floor.sigma_m[rows, cols]
     known = sigma[np.isfinite(sigma)]
-    return _COMMON_TO_SQUARE * float(known.mean()) if known.size else None
+    return float(known.mean()) if known.size else None
 
 
 def _misplacement(

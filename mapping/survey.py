@@ -200,18 +200,20 @@ def correct_survey(
     return _result(strips, keyframes, solution, found, links, ties, steps, rounds, config)
 
 
-def more_alike(before: CorrectedSurvey, after: CorrectedSurvey) -> bool:
-    """Tell whether the passes agree better in the second result than in the first.
+def gain_in_likeness(before: CorrectedSurvey, after: CorrectedSurvey) -> float:
+    """Return by what part the passes agree better in the second result than in the first.
 
     The evidence of a comparison is the log-likelihood ratio of what the two passes saw, given where each is
     thought to have looked: a better floor and track bring more of it, and nothing else enters, so that
-    the rule knows no truth and cannot be pleased by a stiffer graph. Both must have compared squares
-    of one width.
+    the figure knows no truth and cannot be pleased by a stiffer graph. Both must have compared squares
+    of one width. Negative where fewer registrations are believed.
     """
     if not before.diagnostics.rounds or not after.diagnostics.rounds:
-        return False
+        return 0.0
     old, new = before.diagnostics.rounds[-1], after.diagnostics.rounds[-1]
-    return new.evidence > old.evidence and new.used >= 0.9 * old.used
+    if old.evidence <= 0 or new.used < 0.9 * old.used:
+        return -1.0
+    return new.evidence / old.evidence - 1.0
 
 
 def _check(strips: Sequence[ElevationStrip]) -> None:

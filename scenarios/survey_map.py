@@ -119,7 +119,19 @@ def map_survey(
     passes : results of `build_passes` where they are at hand.
     """
     results = build_passes(survey, progress) if passes is None else tuple(passes)
-    corrected = correct_survey([r.strip for r in results], fixes, progress=progress)
+    navigated = [r.strip for r in results]
+    corrected = correct_survey(navigated, fixes, progress=progress)
+    if method == "joint":
+        from scenarios.map_loop import refine_on_map
+
+        corrected = refine_on_map(
+            navigated,
+            corrected,
+            lambda c: looks_of(survey, results, c),
+            fixes,
+            survey.crs,
+            progress,
+        )
     track = whole_track(survey, corrected.trajectory)
     # The joint method has shadows and shading of its own: of the strips it is held to the soundings.
     strips = corrected.strips if method == "shadow" else _floors(results, corrected)
@@ -135,7 +147,7 @@ def map_survey(
     if method == "joint":
         from perception.inversion import invert
 
-        looks = [_look(survey, i, result, corrected, track) for i, result in enumerate(results)]
+        looks = looks_of(survey, results, corrected)
         inversion = invert(looks, cell_m, crs=survey.crs, progress=progress)
         altitude_m = float(np.median(np.concatenate([strip.altitude_m for strip in strips])))
         held = hold_one_sided(inversion.grid, grid, strips, altitude_m)
@@ -330,6 +342,14 @@ def with_pose_sigma(grid: Grid, track: Trajectory, height_sigma_m: FloatArray) -
             slope2 += np.nan_to_num(np.gradient(grid.elevation_m, cell_m, axis=axis)) ** 2
     variance = grid.sigma_m**2 + slope2 * float(np.mean(place_m2)) + height_m2
     return replace(grid, sigma_m=np.sqrt(variance))
+
+
+def looks_of(
+    survey: Survey, results: Sequence[PassSummary], corrected: CorrectedSurvey
+) -> list[Look]:
+    """Return every pass as the joint inversion sees it, at its corrected poses."""
+    track = whole_track(survey, corrected.trajectory)
+    return [_look(survey, i, result, corrected, track) for i, result in enumerate(results)]
 
 
 def _look(

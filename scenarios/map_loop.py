@@ -1,0 +1,64 @@
+"""The loop between map and track: a draft of the map tells where echoes came from, and the passes are matched anew."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mapping.fixes import PositionFix
+from mapping.fusion import default_cell
+from mapping.survey import CorrectedSurvey, correct_survey, gain_in_likeness
+from perception.records import ElevationStrip, Progress, silent
+
+if TYPE_CHECKING:
+    from perception.inversion import Look
+
+logger = logging.getLogger(__name__)
+
+_MOST_ROUNDS = 3
+# Parts of the evidence: what is less than the first is noise of the comparison itself, and a round that brings
+# less than the second does not pay for another draft.
+_NOISE, _PAYS = 0.02, 0.10
+
+
+def refine_on_map(
+    strips: Sequence[ElevationStrip],
+    corrected: CorrectedSurvey,
+    looks: Callable[[CorrectedSurvey], Sequence[Look]],
+    fixes: Sequence[PositionFix] = (),
+    crs: str | None = None,
+    progress: Progress = silent,
+) -> CorrectedSurvey:
+    """Return the survey matched anew on drafts of its own map, as long as the passes agree better for it.
+
+    A strip places echoes on the floor that the soundings suggest, which between tracks errs by a good part of the
+    relief; the joint inversion knows better where it is right. Whether it is, the passes tell
+    (`mapping.survey.gain_in_likeness`): a round that they do not agree better in is thrown away, and one in
+    which they hardly do is the last.
+
+    Parameters
+    ----------
+    strips : as navigated.
+    looks : makes the inversion's looks of a corrected survey.
+    """
+    from perception.inversion import InversionConfig, invert
+
+    rounds = corrected.diagnostics.rounds
+    if not rounds or rounds[-1].used < 3:
+        return corrected
+    altitude_m = float(np.nanmedian(np.concatenate([strip.altitude_m for strip in strips])))
+    # Relief misplaces echoes by its mean over squares of tens of metres: fine cells are not needed.
+    cell_m = max(2.0 * default_cell(strips), altitude_m / 8.0)
+    for _ in range(_MOST_ROUNDS):
+        draft = invert(looks(corrected), cell_m, InversionConfig(), crs, progress).grid
+        again = correct_survey(strips, fixes, progress=progress, floor=draft, known=corrected)
+        gain = gain_in_likeness(corrected, again)
+        logger.info("matched anew on the map: evidence %+.0f %%", 100 * gain)
+        if gain > _NOISE:
+            corrected = again
+        if gain < _PAYS:
+            break
+    return corrected
