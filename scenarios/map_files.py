@@ -14,6 +14,7 @@ from mapping.cog import Frame, Slices, write_cog
 from mapping.compare import Difference, difference, write_changes
 from mapping.mosaic import echo_mosaic, write_mosaic
 from mapping.objects import merge_objects, write_objects
+from mapping.pose_graph_files import write_graph
 from mapping.quality import (
     S44_ORDERS,
     crossing_figures,
@@ -22,6 +23,7 @@ from mapping.quality import (
     survey_quality,
 )
 from mapping.rasters import write_map
+from mapping.round_files import write_rounds
 from mapping.survey import CorrectedSurvey
 from mapping.tracks import write_tracks
 from mapping.trajectories import from_true_north, write_trajectory
@@ -164,6 +166,8 @@ def _write_shared(
     write_trajectory(out / "trajectory-navigated.csv", from_true_north(result.raw_track))
     write_tracks(out / "tracks.gpkg", result.track, result.raw_track)
     write_soundings(out / "soundings.csv", result.corrected, 0.0 if tie is None else tie.shift_m)
+    write_graph(out, result.corrected)
+    write_rounds(out / "rounds.csv", result.corrected.diagnostics.rounds)
     changes = out / "prior-changes.gpkg"
     changes.unlink(missing_ok=True)  # an earlier run's
     if tie is not None:
