@@ -50,7 +50,7 @@ def difference(
     NoOverlapError
         No cell in which both hold a height.
     """
-    _same_frame(first, second)
+    same_frame(first, second)
     easting_m, northing_m = np.meshgrid(*first.centres())
     d = second.sample(easting_m, northing_m) - first.elevation_m
     both = np.isfinite(d)
@@ -77,7 +77,7 @@ def difference(
     return Difference(grid, changed, _statistics(first, second, d, both, sigma, changed))
 
 
-def _same_frame(first: Grid, second: Grid) -> None:
+def same_frame(first: Grid, second: Grid) -> None:
     if first.crs and second.crs:
         a, b = CRS.from_user_input(first.crs), CRS.from_user_input(second.crs)
         if not a.equals(b, ignore_axis_order=True):

@@ -100,7 +100,7 @@ def match(
         surfaces["relief"] = surfaces["relief"].scaled(float(share))
     if not surfaces:
         return _refused("no common ground")
-    shift, covariance, evidence, margin, reason = _judge(
+    shift, covariance, evidence, margin, reason = judge(
         fields, surfaces, inner, cell_m, config, prior_m2
     )
     if reason and not np.isfinite(covariance).all():
@@ -179,7 +179,7 @@ def _signed(field: Fields, surface: Surface, reach: int) -> tuple[Fields, Surfac
     return (u, wu, -v, wv), correlate(u, wu, -v, wv, reach)
 
 
-def _judge(
+def judge(
     fields: dict[str, Fields],
     surfaces: dict[str, Surface],
     inner: int,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixe
 from mapping.overlaps import find_overlaps
 from mapping.placing import at_lines, bridge, on_track
 from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, solve
+from mapping.prior_tie import ties_to_prior
 from mapping.rounds import Registration, TextureStore, register
 from mapping.sharing import solve_shared
 from mapping.textures import MatchConfig, default_cell, thinned
@@ -93,6 +94,8 @@ class Diagnostics:
     indeterminate, worsened : the last graph did not determine its unknowns; or did not improve.
     fixes_used, fixes_refused : absolute fixes believed, and contradicted by the rest.
     largest_correction_m : by which a line was moved.
+    prior_compared, prior_used : squares compared with a prior map, and those that the graph believed.
+    prior_shift_m : (east, north) by which the tie to the prior map moved the track, on average.
     """
 
     rounds: tuple[Round, ...]
@@ -101,6 +104,9 @@ class Diagnostics:
     fixes_used: int
     fixes_refused: int
     largest_correction_m: float
+    prior_compared: int = 0
+    prior_used: int = 0
+    prior_shift_m: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +204,48 @@ def correct_survey(
     if links:
         solution = solve_shared(keyframes, links, ties, config.graph, steps)
     return _result(strips, keyframes, solution, found, links, ties, steps, rounds, config)
+
+
+def tie_to_map(
+    strips: Sequence[ElevationStrip],
+    corrected: CorrectedSurvey,
+    draft: Grid,
+    prior: Grid,
+    config: SurveyConfig | None = None,
+) -> CorrectedSurvey:
+    """Return a corrected survey tied in the plane to a map that was there before.
+
+    Parameters
+    ----------
+    strips : as navigated; `corrected` is what was made of them, `draft` its map.
+    prior : the map to tie to. Where it shares no features with the draft the survey stays as it is.
+    """
+    config = config or SurveyConfig()
+    keyframes, before = corrected.keyframes, corrected.solution
+    side_m = 0.5 * _swath_width(strips)
+    ties = ties_to_prior(draft, prior, keyframes, before, config.graph, side_m)
+    said = replace(corrected.diagnostics, prior_compared=ties.compared)
+    if not ties.fixes:
+        return replace(corrected, diagnostics=said)
+    every = (*corrected.ties, *ties.fixes)
+    solution = solve_shared(keyframes, corrected.links, every, config.graph, corrected.steps)
+    shift_m = (solution.correction_m - before.correction_m).mean(axis=0)
+    tied = _result(
+        strips, keyframes, solution, corrected.registrations, corrected.links, every,
+        corrected.steps, said.rounds, config,
+    )  # fmt: skip
+    own = len(corrected.ties)
+    return replace(
+        tied,
+        diagnostics=replace(
+            tied.diagnostics,
+            fixes_used=int(solution.fix_used[:own].sum()),
+            fixes_refused=int((~solution.fix_used[:own]).sum()),
+            prior_compared=ties.compared,
+            prior_used=int(solution.fix_used[own:].sum()),
+            prior_shift_m=(float(shift_m[0]), float(shift_m[1])),
+        ),
+    )
 
 
 def gain_in_likeness(before: CorrectedSurvey, after: CorrectedSurvey) -> float:

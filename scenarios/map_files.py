@@ -190,6 +190,10 @@ def _survey_metrics(survey: Survey, corrected: CorrectedSurvey) -> dict[str, Any
         "fixes_used": said.fixes_used,
         "fixes_refused": said.fixes_refused,
         "largest_correction_m": said.largest_correction_m,
+        "prior_squares_compared": said.prior_compared,
+        "prior_squares_used": said.prior_used,
+        "prior_shift_east_m": said.prior_shift_m[0],
+        "prior_shift_north_m": said.prior_shift_m[1],
         "track_indeterminate": said.indeterminate,
         "track_worsened": said.worsened,
     }

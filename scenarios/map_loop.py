@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mapping.compare import same_frame
 from mapping.fixes import PositionFix
-from mapping.fusion import default_cell
-from mapping.survey import CorrectedSurvey, correct_survey, gain_in_likeness
-from perception.records import ElevationStrip, Progress, silent
+from mapping.fusion import default_cell, fuse
+from mapping.survey import CorrectedSurvey, correct_survey, gain_in_likeness, tie_to_map
+from perception.records import ElevationStrip, Grid, Progress, silent
 
 if TYPE_CHECKING:
     from perception.inversion import Look
@@ -44,16 +45,11 @@ def refine_on_map(
     strips : as navigated.
     looks : makes the inversion's looks of a corrected survey.
     """
-    from perception.inversion import InversionConfig, invert
-
     rounds = corrected.diagnostics.rounds
     if not rounds or rounds[-1].used < 3:
         return corrected
-    altitude_m = float(np.nanmedian(np.concatenate([strip.altitude_m for strip in strips])))
-    # Relief misplaces echoes by its mean over squares of tens of metres: fine cells are not needed.
-    cell_m = max(2.0 * default_cell(strips), altitude_m / 8.0)
     for _ in range(_MOST_ROUNDS):
-        draft = invert(looks(corrected), cell_m, InversionConfig(), crs, progress).grid
+        draft = draft_map(strips, looks(corrected), crs, progress)
         again = correct_survey(strips, fixes, progress=progress, floor=draft, known=corrected)
         gain = gain_in_likeness(corrected, again)
         logger.info("matched anew on the map: evidence %+.0f %%", 100 * gain)
@@ -62,3 +58,45 @@ def refine_on_map(
         if gain < _PAYS:
             break
     return corrected
+
+
+def draft_map(
+    strips: Sequence[ElevationStrip],
+    looks: Sequence[Look],
+    crs: str | None = None,
+    progress: Progress = silent,
+) -> Grid:
+    """Return a map on cells coarse enough to be had in a fraction of the final one's time."""
+    from perception.inversion import invert
+
+    altitude_m = float(np.nanmedian(np.concatenate([strip.altitude_m for strip in strips])))
+    # Relief misplaces echoes by its mean over squares of tens of metres: fine cells are not needed.
+    cell_m = max(2.0 * default_cell(strips), altitude_m / 8.0)
+    return invert(looks, cell_m, crs=crs, progress=progress).grid
+
+
+def tied_to_prior(
+    strips: Sequence[ElevationStrip],
+    corrected: CorrectedSurvey,
+    looks: Callable[[CorrectedSurvey], Sequence[Look]] | None,
+    prior: Grid,
+    crs: str | None = None,
+    progress: Progress = silent,
+) -> CorrectedSurvey:
+    """Return the survey tied in the plane to a prior map, by a draft of its own.
+
+    Parameters
+    ----------
+    looks : as for `refine_on_map`; None takes the strips' own heights for the draft.
+
+    Raises
+    ------
+    InputError
+        The prior map is in another coordinate system or datum.
+    """
+    if looks is None:
+        draft = fuse(corrected.strips, crs=crs, trajectory=corrected.trajectory)
+    else:
+        draft = draft_map(strips, looks(corrected), crs, progress)
+    same_frame(draft, prior)
+    return tie_to_map(strips, corrected, draft, prior)

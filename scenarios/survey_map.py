@@ -108,30 +108,20 @@ def map_survey(
     cell_m: float | None = None,
     method: str = "joint",
     passes: Sequence[PassSummary] | None = None,
+    prior: Grid | None = None,
     progress: Progress = silent,
 ) -> SurveyMap:
     """Turn the passes of a survey into one map and one corrected track.
 
     Parameters
     ----------
+    prior : a map that was there before, to whose relief the track is tied in the plane; heights are not.
     method : "joint" inverts shading, shadows and soundings of all passes on one grid;
         "shadow" fuses the strips of shadow heights.
     passes : results of `build_passes` where they are at hand.
     """
     results = build_passes(survey, progress) if passes is None else tuple(passes)
-    navigated = [r.strip for r in results]
-    corrected = correct_survey(navigated, fixes, progress=progress)
-    if method == "joint":
-        from scenarios.map_loop import refine_on_map
-
-        corrected = refine_on_map(
-            navigated,
-            corrected,
-            lambda c: looks_of(survey, results, c),
-            fixes,
-            survey.crs,
-            progress,
-        )
+    corrected = _corrected(survey, results, fixes, method, prior, progress)
     track = whole_track(survey, corrected.trajectory)
     # The joint method has shadows and shading of its own: of the strips it is held to the soundings.
     strips = corrected.strips if method == "shadow" else _floors(results, corrected)
@@ -156,6 +146,30 @@ def map_survey(
     raw = navigated_track(survey)
     objects = tuple(corrected_objects(p.objects, raw, track) for p in results)
     return SurveyMap(grid, track, raw, results, corrected, objects, inversion)
+
+
+def _corrected(
+    survey: Survey,
+    results: Sequence[PassSummary],
+    fixes: Sequence[PositionFix],
+    method: str,
+    prior: Grid | None,
+    progress: Progress,
+) -> CorrectedSurvey:
+    """Correct the track by registration, on the map's own drafts, and by a prior map where one is given."""
+    from scenarios.map_loop import refine_on_map, tied_to_prior
+
+    def looks(corrected: CorrectedSurvey) -> list[Look]:
+        return looks_of(survey, results, corrected)
+
+    navigated = [result.strip for result in results]
+    corrected = correct_survey(navigated, fixes, progress=progress)
+    if method == "joint":
+        corrected = refine_on_map(navigated, corrected, looks, fixes, survey.crs, progress)
+    if prior is None:
+        return corrected
+    own = looks if method == "joint" else None
+    return tied_to_prior(navigated, corrected, own, prior, survey.crs, progress)
 
 
 # The last survey's passes: a mission's strips and map are two commands in one process, and the same

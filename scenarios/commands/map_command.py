@@ -53,7 +53,7 @@ class _Tiling:
     help="Cell of the map, m.",
 )
 @click.option("--crs", help="Projected CRS in metres (EPSG:N); default the data's UTM zone.")
-@click.option("--prior", type=click.Path(path_type=Path), help="A map to tie the heights to.")
+@click.option("--prior", type=click.Path(path_type=Path), help="A map to tie track and heights to.")
 @click.option("--fixes", type=click.Path(path_type=Path), help="Absolute fixes, a CSV file.")
 @click.option("--install", type=click.Path(path_type=Path), help="Lever arms and mounting, TOML.")
 @click.option("--tide", type=click.Path(path_type=Path), help="Tide, a CSV file.")
@@ -208,7 +208,9 @@ def _in_one_piece(
     from scenarios.map_files import tie_to_prior, write_whole
     from scenarios.survey_map import map_survey
 
-    result = map_survey(survey, fixes=fixes, cell_m=cell_m, method=method, progress=progress)
+    result = map_survey(
+        survey, fixes=fixes, cell_m=cell_m, method=method, prior=old, progress=progress
+    )
     # Tied before anything is written: every file of the folder is of one height.
     tie = None if old is None else tie_to_prior(result.grid, old)
     return write_whole(out, survey, result, tie) | ({} if tie is None else tie.metrics())
