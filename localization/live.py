@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from localization.estimate import Estimate
 from localization.measurements import Measurement, Sensors
-from localization.navigator import Estimate, Navigator
+from localization.navigator import Navigator
 from localization.saved import bring_to, state_of
 from perception.files import whole_file
 from perception.records import InputError

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
+from localization.estimate import CONVERGED, LOST, Estimate
 from localization.integrity import protection_level
 from localization.navfile import NavTable
-from localization.navigator import CONVERGED, LOST, Estimate, Navigator
+from localization.navigator import Navigator
 from mapping.fixes import PositionFix
 from perception.records import BoolArray, FloatArray, IntArray, Progress, Trajectory, silent
 

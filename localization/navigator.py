@@ -1,8 +1,10 @@
 """The navigator: one measurement in, one position out, with covariance, status and protection level.
 
     dead reckoning -> particle search -> Kalman bank, on probation -> converged
-                          ^                        |
+                          ^              search anew as witness           |
                           '---- lost: health failed, from the last trusted state, a wider box
+
+While a place is on probation the search, begun anew, is its witness (`localization.witness`).
 
 Positions are dead-reckoned positions plus an estimated offset, so a late or repeated row costs
 nothing: it is answered with the offset of the moment.
@@ -17,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.bank import KalmanBank
+from localization.estimate import CONVERGED, LOST, RECKONING, SEARCHING, Estimate
 from localization.integrity import (
     HealthMonitor,
     protection_level,
@@ -26,15 +29,14 @@ from localization.integrity import (
 from localization.measurements import Measurement, Sensors, Soundings, beam_vectors, soundings_of
 from localization.particles import ParticleFilter
 from localization.proof import Proof, doubt_of
-from localization.reckoning import Reckoning
+from localization.reckoning import Gaussian, Reckoning
 from localization.rival import Evidence
 from localization.terrain import TerrainMap
 from localization.view import view_of
+from localization.witness import Opinion, opinion_of
 from perception.records import FloatArray
 
 logger = logging.getLogger(__name__)
-
-CONVERGED, SEARCHING, RECKONING, LOST = "converged", "searching", "dead-reckoning", "lost"
 
 # Seconds without a sounding after which the status is dead reckoning.
 _SILENT_S = 15.0
@@ -70,25 +72,6 @@ class NavigatorConfig:
     walk_m_sqrt_h: float = 4.0
     reset_depth_m: float = 10.0
     grow: float = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Where the vehicle is, by all measurements up to this one.
-
-    `covariance_m2` (2, 2) is of easting and northing; `state` (5,) is offset east, offset north,
-    heading bias, scale, depth bias, and `state_covariance` theirs; `reason` tells what changed.
-    """
-
-    time_s: float
-    easting_m: float
-    northing_m: float
-    covariance_m2: FloatArray
-    status: str
-    protection_m: float
-    state: FloatArray
-    state_covariance: FloatArray
-    reason: str = ""
 
 
 class Navigator:
@@ -162,6 +145,7 @@ class Navigator:
         """
         if self.tracking:
             fused = self.bank.fuse(offset_m, covariance_m2)
+            self.search.fuse(offset_m, covariance_m2)
             reason = "" if fused else "outside fix contradicts the track: left out"
             return self._estimate(measurement, reason)
         self.search.fuse(offset_m, covariance_m2)
@@ -202,7 +186,7 @@ class Navigator:
         self.reckoning.advance(step, seconds, slip_m2)
         if self.tracking:
             self.bank.predict(step[0], step[1], seconds, slip_m2)
-        else:
+        if not self.tracking or not self.proof.believed:
             walk_m2 = self.reckoning.walk_m2_s * seconds + slip_m2
             self.search.predict(step[0], step[1], walk_m2)
         return reason
@@ -219,12 +203,15 @@ class Navigator:
         self.bank.see(soundings)
         if self.tracking:
             return self._track(m, soundings)
-        tide = self.sensors.tide_m_sqrt_h**2 / 3600.0 * 3.0
-        met = self.search.update(soundings, m.easting_m, m.northing_m, self.since_update_m, tide)
+        met = self._search(m, soundings)
         self.since_update_m = 0.0
         if met > 0:
             self.heard_s = m.time_s
         return self._hand_over()
+
+    def _search(self, m: Measurement, soundings: Soundings) -> float:
+        tide = self.sensors.tide_m_sqrt_h**2 / 3600.0 * 3.0
+        return self.search.update(soundings, m.easting_m, m.northing_m, self.since_update_m, tide)
 
     def _hand_over(self) -> str:
         """Let the Kalman bank take over once the search has one narrow place left."""
@@ -234,12 +221,33 @@ class Navigator:
         # A Gaussian has 99.8 % within 3.5 sigmas: less means that rivals live outside.
         if self.search.share_within(mean, covariance, 3.5) < 0.98:
             return ""
+        self._begin_tracking(mean, covariance)
+        return "place found; on probation"
+
+    def _begin_tracking(self, mean: FloatArray, covariance: FloatArray) -> None:
         self.bank.start(mean, covariance)
         self.health.reset()
         self.tracking = True
         self.proof.begin(self._surprise(mean, covariance))
         self.rival.reset()
-        return "place found; on probation"
+        if not self.proof.believed:
+            self.search.start(*self._prior())
+
+    def _prior(self) -> Gaussian:
+        """What is known without the match: the box of a search."""
+        mean, covariance = self.reckoning.state
+        if not self.losses:
+            return mean, covariance
+        box = self._box()
+        # The cause of the loss may have been a step of the depth.
+        box[4, :], box[:, 4] = 0.0, 0.0
+        box[4, 4] = self.config.reset_depth_m**2
+        return mean, box
+
+    def _hear_witness(self, m: Measurement, soundings: Soundings) -> Opinion:
+        """Let the search anew have this update's soundings, and say what it makes of the place."""
+        self._search(m, soundings)
+        return opinion_of(self.search, *self.bank.moments(), self.config.hand_over_m)
 
     def _surprise(self, mean: FloatArray, covariance: FloatArray) -> float:
         """Evidence against a place far from where dead reckoning has it, beyond three sigmas."""
@@ -266,12 +274,15 @@ class Navigator:
         likeliest = self.bank.likeliest()
         gained = self.rival.update(views[likeliest.reading], likeliest)
         fit = self.bank.update(views)
+        heard = Opinion.CONFIRMS if self.proof.believed else self._hear_witness(m, soundings)
         self.since_update_m = 0.0
         if not len(fit.normalised):
             return ""
         self.heard_s = m.time_s
         if fit.common_step_m:
             self.rival.reset()
+            if not self.proof.believed:
+                self.search.start(*self._prior())
             return f"depth stepped by {fit.common_step_m:+.1f} m; depth bias set free"
         self.health.add(fit, len(self.sensors.beams))
         verdict = self.health.verdict()
@@ -284,7 +295,12 @@ class Navigator:
         if self.proof.refuted and strained:
             return self._lose("free ground explains the soundings better than the map")
         self.proof.updates += 1
-        if self.proof.holds and _largest(covariance) < self.config.converged_m:
+        if heard is Opinion.CONTRADICTS:
+            self.proof.fail()
+            self._begin_tracking(*self.search.moments())
+            return "later soundings agree on another place; that is on probation now"
+        confirmed = heard is Opinion.CONFIRMS and self.proof.holds
+        if confirmed and _largest(covariance) < self.config.converged_m:
             return self._trust()
         return ""
 
@@ -301,14 +317,12 @@ class Navigator:
         self.losses += 1
         self.proof.fail()
         self.reckoning.fall_back()
-        mean, box = self.reckoning.state[0], self._box()
-        box[4, :], box[:, 4] = 0.0, 0.0
-        box[4, 4] = self.config.reset_depth_m**2
         self.tracking = False
         self.health.reset()
-        self.search.start(mean, box)
+        prior = self._prior()
+        self.search.start(*prior)
         logger.info("lost: %s", reason)
-        return f"lost: {reason}; searching again within {_largest(box):.0f} m"
+        return f"lost: {reason}; searching again within {_largest(prior[1]):.0f} m"
 
     def _box(self) -> FloatArray:
         return self.reckoning.box(self.losses, self.config.grow)
@@ -355,7 +369,8 @@ class Navigator:
         if not self.proof.believed:
             doubt = self.proof.doubt
             mean, covariance = with_doubt(mean, covariance, *self.reckoning.state, doubt)
-        if not silent and self.proof.holds and _largest(covariance) < self.config.converged_m:
+        sure = self.proof.believed and self.proof.holds
+        if not silent and sure and _largest(covariance) < self.config.converged_m:
             status = CONVERGED
         return mean, covariance, status
 

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from localization.estimate import CONVERGED
 from localization.maperror import assumed_sigma
 from localization.measurements import Sensors, read_sensors
 from localization.mission import Navigation, navigate
 from localization.navchecks import check_against_map
 from localization.navfile import NavTable, read_nav
-from localization.navigator import CONVERGED, Navigator, NavigatorConfig
+from localization.navigator import Navigator, NavigatorConfig
 from localization.terrain import TerrainMap, terrain_map
 from mapping.fixes import write_fixes
 from mapping.rasters import read_map

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from localization.estimate import CONVERGED, LOST
 from localization.measurements import beam_vectors, soundings_of
 from localization.navfile import NavTable, nav_table
-from localization.navigator import CONVERGED, LOST, Navigator
+from localization.navigator import Navigator
 from localization.particles import ParticleFilter
 from localization.terrain import TerrainMap, terrain_map
 from perception.records import FloatArray, Progress

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
+from localization.estimate import CONVERGED
 from localization.navfile import nav_table
-from localization.navigator import CONVERGED, Navigator
+from localization.navigator import Navigator
 from localization.terrain import terrain_map
 from perception.records import FloatArray, Progress
 from scenarios.benchmarks import Row, Table

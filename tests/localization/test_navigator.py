@@ -6,9 +6,10 @@ import navsets
 import numpy as np
 import pytest
 
+from localization.estimate import CONVERGED, LOST
 from localization.mission import Navigation, navigate
 from localization.navfile import nav_table
-from localization.navigator import CONVERGED, LOST, Navigator
+from localization.navigator import Navigator
 from localization.terrain import terrain_map
 from perception.records import FloatArray
 
