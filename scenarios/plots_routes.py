@@ -11,6 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LightSource
+from matplotlib.patheffects import withStroke
 
 from perception.files import whole_file
 from perception.records import FloatArray
@@ -23,6 +24,10 @@ from planning.surface import Surface
 # Pixels along the longer side of the map; a larger map is thinned.
 _PIXELS = 900
 _DPI = 110
+# Least width of a map's picture over its height, where the map is as wide.
+_LEAST_ASPECT = 0.7
+# White lines are lost on pale ground and in a legend without an edge.
+_OUTLINED = (withStroke(linewidth=2.0, foreground="0.25"),)
 
 
 def picture_plan(path: Path, plan: Plan) -> None:
@@ -40,7 +45,10 @@ def _picture_route(path: Path, plan: Plan, route: Route) -> None:
     _draw_map(upper, surface, box)
     if len(plan.grid_path):
         e, n = surface.world(plan.grid_path[:, 0], plan.grid_path[:, 1])
-        upper.plot(e, n, color="white", lw=0.8, ls=":", label="grid search at the floor, no limits")
+        upper.plot(
+            e, n, color="white", lw=1.0, ls=":", label="grid search at the floor, no limits",
+            path_effects=_OUTLINED,
+        )  # fmt: skip
     upper.plot(route.easting_m, route.northing_m, color="crimson", lw=1.6, label="route")
     upper.plot(*route.worst[:2], "o", mfc="none", mec="gold", ms=9, mew=2, label="least margin")
     upper.plot(
@@ -49,7 +57,6 @@ def _picture_route(path: Path, plan: Plan, route: Route) -> None:
     upper.plot(
         route.easting_m[-1], route.northing_m[-1], "s", color="white", mec="black", label="goal"
     )
-    upper.legend(loc="best", fontsize=7, framealpha=0.85)
     upper.set_title(
         f"cost {route.cost:.0f} = {plan.ratio:.3f} of the grid search; "
         f"length {route.length_m:.0f} m, mean altitude {route.mean_altitude_m:.2f} m",
@@ -62,15 +69,17 @@ def _picture_route(path: Path, plan: Plan, route: Route) -> None:
     bottom = z - route.altitude_m
     limits = surface.limits
     _draw_profile(lower, s, bottom, z, limits.floor_m, limits.ceiling_m)
+    _legends(figure, upper, lower)
     at = int(
         np.argmin(np.hypot(route.easting_m - route.worst[0], route.northing_m - route.worst[1]))
     )
     lower.plot(s[at], -route.worst[2], "o", mfc="none", mec="goldenrod", ms=9, mew=2)
-    lower.annotate(
-        f"least margin {route.min_clearance_margin_m:.3f} m over {limits.floor_m:g} m"
-        + (f" + {plan.k:.2f} sigma" if plan.k > 0 else ""),
-        (s[at], -route.worst[2]), xytext=(0, 22), textcoords="offset points", fontsize=7, ha="right" if s[at] > 0.7 * s[-1] else "left",
-    )  # fmt: skip
+    over = f"{limits.floor_m:g} m" + (f" + {plan.k:.2f} sigma" if plan.k > 0 else "")
+    lower.set_title(
+        f"least margin {route.min_clearance_margin_m:.3f} m over {over} (circle); "
+        f"least slant distance to the ground {route.min_stand_off_m:.2f} m",
+        fontsize=8,
+    )
     _save(path, figure)
 
 
@@ -80,7 +89,6 @@ def _picture_blockage(path: Path, surface: Surface, blockage: Blockage) -> None:
     _draw_map(upper, surface, _box(surface, e, n))
     upper.plot(e, n, color="orange", lw=1.3, label="the path that breaks least")
     upper.plot(*blockage.place, "x", color="crimson", ms=11, mew=2.5, label="what blocks")
-    upper.legend(loc="best", fontsize=7)
     upper.set_title("no route: " + _wrapped(blockage.reason, 95), fontsize=7.5)
     s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(e), np.diff(n)))])
     _draw_profile(
@@ -93,6 +101,7 @@ def _picture_blockage(path: Path, surface: Surface, blockage: Blockage) -> None:
     )
     at = int(np.argmin(np.hypot(e - blockage.place[0], n - blockage.place[1])))
     lower.axvline(s[at], color="crimson", lw=1.0)
+    _legends(figure, upper, lower)
     _save(path, figure)
 
 
@@ -105,9 +114,11 @@ def picture_survey(path: Path, surface: Surface, survey: Survey, area: Any) -> N
     _draw_map(upper, surface, _box(surface, w.easting_m, w.northing_m))
     upper.plot(*shapely.get_coordinates(area.exterior).T, color="gold", lw=1.5, label="area")
     upper.plot(w.easting_m, w.northing_m, color="crimson", lw=0.8, label="track with turns")
-    for begin, end in survey.lines:
-        upper.plot([begin[0], end[0]], [begin[1], end[1]], color="white", lw=1.2)
-    upper.legend(loc="best", fontsize=7)
+    for i, (begin, end) in enumerate(survey.lines):
+        upper.plot(
+            [begin[0], end[0]], [begin[1], end[1]], color="white", lw=1.2,
+            label="lines" if i == 0 else None, path_effects=_OUTLINED,
+        )  # fmt: skip
     upper.set_title(
         f"{len(survey.lines)} lines cover {100 * survey.covered:.1f} % of the area", fontsize=9
     )
@@ -119,6 +130,7 @@ def picture_survey(path: Path, surface: Surface, survey: Survey, area: Any) -> N
         _draw_profile(
             lower, s, z - w.altitude_m, z, surface.limits.floor_m, surface.limits.ceiling_m
         )
+    _legends(figure, upper, lower)
     _save(path, figure)
 
 
@@ -127,17 +139,19 @@ def _figure() -> tuple[Any, Any]:
 
 
 def _box(surface: Surface, easting_m: FloatArray, northing_m: FloatArray) -> tuple[int, ...]:
-    """Return rows and columns around a path, with a margin of a fifth of its extent."""
+    """Return rows and columns around a path, with a margin, and not too narrow to read."""
     x, y = surface.local(easting_m, northing_m)
     rows, cols = surface.shape
-    out = []
+    extent = max(float(np.ptp(x)), float(np.ptp(y)))
+    out: list[int] = []
     for values, cell, n in ((y, surface.cell_m[1], rows), (x, surface.cell_m[0], cols)):
-        extent = max(float(np.ptp(x)), float(np.ptp(y)))
         margin = 0.15 * extent + 10 * cell
-        out += [
-            max(0, int((values.min() - margin) / cell)),
-            min(n, int((values.max() + margin) / cell) + 2),
-        ]
+        half = max(0.5 * float(np.ptp(values)) + margin, _LEAST_ASPECT * (0.65 * extent))
+        middle = 0.5 * float(values.max() + values.min())
+        # Near the map's edge the box slides inside rather than being cut.
+        wide = min(n, int(2.0 * half / cell) + 2)
+        first = min(max(0, int((middle - half) / cell)), n - wide)
+        out += [first, first + wide]
     return tuple(out)
 
 
@@ -166,7 +180,8 @@ def _draw_map(axes: Any, surface: Surface, box: tuple[int, ...]) -> None:
     axes.set_ylabel("northing (m)")
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.tick_params(labelsize=7)
-    axes.locator_params(nbins=6)
+    axes.locator_params(axis="x", nbins=4)
+    axes.locator_params(axis="y", nbins=6)
 
 
 def _draw_profile(
@@ -181,7 +196,16 @@ def _draw_profile(
     axes.set_xlabel("distance (m)")
     axes.set_ylabel("height (m)")
     axes.set_xlim(s[0], max(s[-1], s[0] + 1e-6))
-    axes.legend(loc="best", fontsize=7, ncols=4)
+
+
+def _legends(figure: Any, upper: Any, lower: Any) -> None:
+    """Put both legends outside the axes: inside, they would cover the route somewhere."""
+    for axes, place in ((upper, "outside upper center"), (lower, "outside lower center")):
+        handles, labels = axes.get_legend_handles_labels()
+        if handles:
+            figure.legend(
+                handles, labels, loc=place, fontsize=7, ncols=5, facecolor="0.93", frameon=True
+            )
 
 
 def _wrapped(text: str, width: int) -> str:

@@ -167,6 +167,40 @@ def test_a_wall_of_no_data_is_named_within_a_cell_at_its_thinnest():
     assert 54 <= row <= 61 and abs(col - 70) <= 1
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", ["land", "no data", "too deep", "no-go"])
+def test_the_thinnest_place_of_a_planted_wall_is_named_within_a_cell(seed, kind):
+    rng = np.random.default_rng(seed)
+    row = np.arange(100)[:, None]
+    first = 45 + np.cumsum(rng.integers(-1, 2, 100))
+    place = int(rng.integers(15, 85))
+    last = first + 9 + np.minimum(np.abs(np.arange(100) - place), 4)
+    wall = (row >= first) & (row <= last)
+    # One thin place, a cell wide: a notch in the wall's far side.
+    wall[first[place] + 3 :, place] = False
+    z = flat(100, 100)
+    limits, more = VehicleLimits(depth_max_m=90.0), {}
+    if kind == "no-go":
+        more["forbidden"] = wall
+    else:
+        z[wall] = {"land": 3.0, "no data": np.nan, "too deep": -200.0}[kind]
+    grid = grid_of(z)
+    plan = plan_route(
+        grid, at(grid, 5, 50), at(grid, 95, 50), limits, config=QUICK, **more
+    )  # fmt: skip
+    assert plan.route is None
+    word = {
+        "land": "above the water",
+        "no data": "no data",
+        "too deep": "depth_max_m",
+        "no-go": "no-go",
+    }
+    assert word[kind] in plan.reason
+    found_row, found_col = grid.fractional_index(*(np.array(v) for v in plan.blockage.place))
+    assert abs(found_col - place) <= 1
+    assert first[place] - 1 <= found_row <= first[place] + 3
+
+
 def test_a_wall_too_steep_for_pitch_and_ceiling_is_named_with_a_way_out():
     # The channel is too narrow to climb the wall's face by skimming along it.
     z = flat(200, 60, 60.0)
