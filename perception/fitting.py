@@ -1,13 +1,18 @@
-"""Fit one shadow's surroundings with the bump-or-pit model: height, shape, place, and their covariance."""
+"""Fit one shadow's surroundings with the bump-or-pit model: height, shape, place, and their covariance.
+
+The likelihood has many hills of its own: all starts are weighed on a coarse copy of the echo, the best of every
+length and outline climb there, and the few that lead go on in full.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 
-from perception.records import FloatArray
-from perception.silhouettes import N_PARAMETERS, fisher_step, log_likelihood
+from perception.records import FloatArray, IntArray
+from perception.silhouettes import N_PARAMETERS, N_SHAPE, fisher_step, log_likelihood
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +36,40 @@ class Patch:
     weight: float
     leak: float
 
+    def halved(self) -> Patch:
+        """Return the patch with bins joined in pairs; a cell of one known bin counts as that bin."""
+        bins = self.ratio.shape[1] // 2
+        pairs = self.ratio[:, : 2 * bins].reshape(-1, bins, 2)
+        known = np.isfinite(pairs)
+        mean = np.where(known, pairs, 0).sum(axis=2) / np.maximum(known.sum(axis=2), 1)
+        mean[~known.any(axis=2)] = np.nan
+        return replace(
+            self,
+            ratio=np.ascontiguousarray(mean),
+            step_m=2 * self.step_m,
+            weight=2 * self.weight,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Starts:
+    """Starting points of a fit, one per row: `sign` and `corner` (s,), `parameters` (s, 10)."""
+
+    sign: FloatArray
+    corner: FloatArray
+    parameters: FloatArray
+
+    def take(self, rows: IntArray) -> Starts:
+        """Return the chosen starts."""
+        return Starts(self.sign[rows], self.corner[rows], self.parameters[rows])
+
 
 @dataclass(frozen=True, slots=True)
 class BumpFit:
-    """The best bump (`sign` 1) or pit (-1): parameters x0, y0, log|A|, log sx, log sy, log beta,
-    log kappa.
+    """The best bump (`sign` 1) or pit (-1), with the parameters of `perception.silhouettes`.
 
-    `corner` is 2 for an elliptic footprint, 6 for a rectangular one; `gain` is the log likelihood over that of a flat floor, priors included.
+    `corner` is 2 for an elliptic footprint, 4 for a rectangular one; `gain` is the log likelihood over that of
+    a flat floor, priors included.
     """
 
     parameters: FloatArray
@@ -57,50 +89,77 @@ HIGHLIGHT_CAP = 5.0
 # Priors in logarithms: objects are about as long as wide; shapes lie between a Gaussian and a flat top.
 _ASPECT_SIGMA = 0.5
 _SHAPE_MEAN, _SHAPE_SIGMA = float(np.log(1.7)), 0.6
-_SHAPE_BOUNDS = (float(np.log(0.8)), float(np.log(8.0)))
+_SHAPE_LOW, _SHAPE_HIGH = float(np.log(0.8)), float(np.log(8.0))
 # The floor's angular law is near Lambert's square, but recorders and sediments differ.
-_LAW_MEAN, _LAW_SIGMA = float(np.log(1.9)), 0.18
+_LAW_MEAN, _LAW_SIGMA = float(np.log(1.95)), 0.13
+# The gain follows albedo over blocks larger than objects; patches of sediment are smaller.
+_LEVEL_SIGMA = 0.3
 _FACETS_PER_BIN = 1.5
-# Rounds of climbing from every start, and from the best of each kind afterwards.
-_FIRST_ROUNDS, _LAST_ROUNDS = 5, 14
+# Rounds of climbing: every start on the coarse patch, the best of those, and the leaders in full.
+_FIRST_ROUNDS, _MIDDLE_ROUNDS, _LAST_ROUNDS = 3, 5, 14
+_MIDDLE_STARTS, _LAST_STARTS = 3, 2
+# A kind this far behind the other after the coarse rounds will not catch up.
+_BEHIND = 0.6
+# Halving a patch of fewer bins would leave too little of it.
+_LEAST_BINS = 36
 
 
-def fit_patch(
-    patch: Patch, starts: list[tuple[float, float, FloatArray]], favour: float = 0.0
-) -> BumpFit | None:
-    """Return the most likely fit over all starts (sign, corner, parameters), or None where none converges.
+def fit_patch(patch: Patch, starts: Starts, favour: float = 0.0) -> BumpFit | None:
+    """Return the most likely fit over all starts, or None where none converges.
 
     `favour` is what other evidence adds to the log likelihood of a hill over a crater.
     """
-    flat_value = _flat_likelihood(patch)
-    scored = [
-        (_likelihood(patch, sign, corner, at) + _prior(at)[0], sign, corner, at)
-        for sign, corner, at in starts
+    coarse = patch.halved() if patch.ratio.shape[1] >= _LEAST_BINS else patch
+    value = _score(starts.sign, starts.corner, starts.parameters, *_fixed(coarse))
+    chosen = _leaders(starts, value)
+    climbed = {
+        sign: _climbed(coarse, starts.take(chosen[starts.sign[chosen] == sign]))
+        for sign in (1.0, -1.0)
+    }
+    best = max((fit.gain for fits in climbed.values() for fit in fits), default=0.0)
+    found = []
+    for fits in climbed.values():
+        if fits and fits[0].gain > _BEHIND * best:
+            found += [_climb(patch, fit, _LAST_ROUNDS) for fit in fits[:_LAST_STARTS]]
+    good = [fit for fit in found if fit is not None]
+    return max(good, key=lambda fit: fit.gain + 0.5 * fit.sign * favour) if good else None
+
+
+def _leaders(starts: Starts, value: FloatArray) -> IntArray:
+    """Return the best start of each kind, outline and length across the track.
+
+    The best of all alone would often be the longest ones, which fit loosely at once and cannot be mended
+    by climbing.
+    """
+    best: dict[tuple[float, float, float], int] = {}
+    for row in np.argsort(value):
+        key = (float(starts.sign[row]), float(starts.corner[row]), float(starts.parameters[row, 3]))
+        best[key] = int(row)
+    return np.array(sorted(best.values()), dtype=np.int64)
+
+
+def _climbed(patch: Patch, starts: Starts) -> list[BumpFit]:
+    """Climb from each start, on from the best few, and return those, the best first."""
+    first = [
+        _climb(patch, BumpFit(at, np.empty(0), float(sign), float(corner), 0.0), _FIRST_ROUNDS)
+        for sign, corner, at in zip(starts.sign, starts.corner, starts.parameters, strict=True)
     ]
-    first = []
-    for sign in (1.0, -1.0):
-        # One start of each length across the track: the best of all alone would often be the longest ones,
-        # which fit loosely at once and cannot be mended by climbing.
-        best_of: dict[float, tuple[float, float, float, FloatArray]] = {}
-        for start in scored:
-            length = float(start[3][3])
-            if start[1] == sign and (length not in best_of or start[0] > best_of[length][0]):
-                best_of[length] = start
-        first += [
-            _climb(patch, *start[1:], flat_value, _FIRST_ROUNDS) for start in best_of.values()
-        ]
-    last = []
-    best = max((f.gain for f in first if f is not None), default=0.0)
-    for sign in (1.0, -1.0):
-        mine = sorted((f for f in first if f is not None and f.sign == sign), key=lambda f: -f.gain)
-        # A kind that is far behind after the first rounds will not catch up.
-        for fit in mine[:1]:
-            if fit.gain > 0.6 * best:
-                last.append(
-                    _climb(patch, sign, fit.corner, fit.parameters, flat_value, _LAST_ROUNDS)
-                )
-    found = [fit for fit in last if fit is not None]
-    return max(found, key=lambda fit: fit.gain + 0.5 * fit.sign * favour) if found else None
+    ranked = sorted((fit for fit in first if fit is not None), key=lambda fit: -fit.gain)
+    further = [_climb(patch, fit, _MIDDLE_ROUNDS) for fit in ranked[:_MIDDLE_STARTS]]
+    return sorted((fit for fit in further if fit is not None), key=lambda fit: -fit.gain)
+
+
+def _climb(patch: Patch, start: BumpFit, rounds: int) -> BumpFit | None:
+    """Climb the posterior of a patch from a fit's parameters; None where it leads nowhere."""
+    at, value, information = climb(
+        start.parameters, start.sign, start.corner, *_fixed(patch), rounds
+    )
+    if not (np.all(np.isfinite(at)) and np.all(np.isfinite(information))):
+        return None
+    # Unseen directions come out very wide.
+    covariance = np.linalg.inv(information + 1e-6 * np.eye(N_PARAMETERS))
+    gain = float(value - _flat_likelihood(patch))
+    return BumpFit(at, covariance, start.sign, start.corner, gain)
 
 
 def _facet_m(patch: Patch) -> float:
@@ -110,13 +169,11 @@ def _facet_m(patch: Patch) -> float:
     return float(patch.step_m * far_m / ground_m / _FACETS_PER_BIN)
 
 
-def _fixed(patch: Patch) -> tuple[FloatArray, FloatArray, float, float, float, float, float, float]:
-    return (patch.drop_m, patch.along_m, patch.start_m, patch.step_m, patch.leak, _facet_m(patch),
-            HIGHLIGHT_CAP, patch.weight)  # fmt: skip
-
-
-def _likelihood(patch: Patch, sign: float, corner: float, at: FloatArray) -> float:
-    return float(log_likelihood(at, sign, corner, patch.ratio, *_fixed(patch)))
+def _fixed(
+    patch: Patch,
+) -> tuple[FloatArray, FloatArray, FloatArray, float, float, float, float, float, float]:
+    return (patch.ratio, patch.drop_m, patch.along_m, patch.start_m, patch.step_m, patch.leak,
+            _facet_m(patch), HIGHLIGHT_CAP, patch.weight)  # fmt: skip
 
 
 def _flat_likelihood(patch: Patch) -> float:
@@ -126,67 +183,97 @@ def _flat_likelihood(patch: Patch) -> float:
     return float(-patch.weight * each.sum())
 
 
-def _prior(parameters: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Return log prior, its gradient and its information."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _prior(parameters):  # type: ignore[no-untyped-def]
+    """Return log prior, its gradient (10,) and its information (10, 10)."""
     gradient = np.zeros(N_PARAMETERS)
     information = np.zeros((N_PARAMETERS, N_PARAMETERS))
     aspect = (parameters[3] - parameters[4]) / _ASPECT_SIGMA**2
     shape = (parameters[5] - _SHAPE_MEAN) / _SHAPE_SIGMA**2
-    gradient[3], gradient[4], gradient[5] = -aspect, aspect, -shape
-    information[3:5, 3:5] = np.array([[1, -1], [-1, 1]]) / _ASPECT_SIGMA**2
-    information[5, 5] = 1 / _SHAPE_SIGMA**2
     law = (parameters[6] - _LAW_MEAN) / _LAW_SIGMA**2
-    gradient[6], information[6, 6] = -law, 1 / _LAW_SIGMA**2
+    gradient[3], gradient[4], gradient[5], gradient[6] = -aspect, aspect, -shape, -law
+    information[3, 3] = information[4, 4] = 1 / _ASPECT_SIGMA**2
+    information[3, 4] = information[4, 3] = -1 / _ASPECT_SIGMA**2
+    information[5, 5] = 1 / _SHAPE_SIGMA**2
+    information[6, 6] = 1 / _LAW_SIGMA**2
+    level = 0.0
+    for p in range(N_SHAPE, N_PARAMETERS):
+        gradient[p] = -parameters[p] / _LEVEL_SIGMA**2
+        information[p, p] = 1 / _LEVEL_SIGMA**2
+        level += parameters[p] ** 2 / _LEVEL_SIGMA**2
     value = -0.5 * (
-        aspect * (parameters[3] - parameters[4])
+        level
+        + aspect * (parameters[3] - parameters[4])
         + shape * (parameters[5] - _SHAPE_MEAN)
         + law * (parameters[6] - _LAW_MEAN)
     )
-    return float(value), gradient, information
+    return value, gradient, information
 
 
-def _climb(
-    patch: Patch, sign: float, corner: float, start: FloatArray, flat_value: float, rounds: int
-) -> BumpFit | None:
-    """Climb the posterior from `start` by damped Fisher scoring."""
-    fixed = _fixed(patch)
-    at = start.copy()
-    damping = 1e-2
-    value, gradient, information = fisher_step(at, sign, corner, patch.ratio, *fixed)
-    prior_value, prior_gradient, prior_information = _prior(at)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _score(  # type: ignore[no-untyped-def]
+    sign, corner, parameters, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
+):
+    """Return the log posterior (s,) of every start."""
+    value = np.empty(len(sign))
+    for s in range(len(sign)):
+        value[s] = log_likelihood(
+            parameters[s], sign[s], corner[s], ratio, drop_m, along_m, start_m, step_m, leak,
+            facet_m, cap, weight,
+        ) + _prior(parameters[s])[0]  # fmt: skip
+    return value
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def climb(  # type: ignore[no-untyped-def]
+    start, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight, rounds
+):
+    """Climb the posterior from `start` by damped Fisher scoring, at most `rounds` steps.
+
+    Returns the parameters (10,), log posterior and its information (10, 10).
+    """
+    at, damping = start.copy(), 1e-2
+    value, gradient, information = fisher_step(
+        at, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
+    )
+    prior = _prior(at)
+    value += prior[0]
+    limit = np.array([0.0, 0.0, 0.5, 0.5, 0.5, 0.7, 0.3, 0.3, 0.3, 0.3])
     for _ in range(rounds):
-        whole = information + prior_information
-        scale = np.diag(np.diag(whole) * damping + 1e-6)
-        step = np.linalg.solve(whole + scale, gradient + prior_gradient)
+        whole = information + prior[2]
+        for p in range(N_PARAMETERS):
+            whole[p, p] += damping * whole[p, p] + 1e-6
+        step = np.linalg.solve(whole, gradient + prior[1])
         # A logarithm moves by half at most, a place by the object's own width: the model is not linear.
-        width = np.exp(at[3:5])
-        step = np.clip(
-            step,
-            -np.array([*width, 0.5, 0.5, 0.5, 0.7, 0.3]),
-            np.array([*width, 0.5, 0.5, 0.5, 0.7, 0.3]),
-        )
-        trial = at + step
-        trial[5] = np.clip(trial[5], *_SHAPE_BOUNDS)
-        trial_value = log_likelihood(trial, sign, corner, patch.ratio, *fixed)
+        limit[0], limit[1] = np.exp(at[3]), np.exp(at[4])
+        trial = at + np.minimum(np.maximum(step, -limit), limit)
+        trial[5] = min(max(trial[5], _SHAPE_LOW), _SHAPE_HIGH)
         trial_prior = _prior(trial)
-        rise = trial_value + trial_prior[0] - value - prior_value
+        trial_value = trial_prior[0] + log_likelihood(
+            trial, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
+        )
+        rise = trial_value - value
         if rise > 0:
-            at, damping = trial, max(damping * 0.3, 1e-4)
-            value, gradient, information = fisher_step(at, sign, corner, patch.ratio, *fixed)
-            prior_value, prior_gradient, prior_information = trial_prior
+            at, prior, damping = trial, trial_prior, max(damping * 0.3, 1e-4)
+            value, gradient, information = fisher_step(
+                at,
+                sign,
+                corner,
+                ratio,
+                drop_m,
+                along_m,
+                start_m,
+                step_m,
+                leak,
+                facet_m,
+                cap,
+                weight,
+            )
+            value += prior[0]
             if rise < 0.05:
                 break
         else:
             damping *= 6
             if damping > 1e4:
                 break
-    covariance = _inverse(information + prior_information)
-    if not np.all(np.isfinite(covariance)) or not np.all(np.isfinite(at)):
-        return None
-    return BumpFit(at, covariance, sign, corner, float(value + prior_value - flat_value))
-
-
-def _inverse(information: FloatArray) -> FloatArray:
-    """Return the inverse of an information matrix; unseen directions come out very wide."""
-    inverse: FloatArray = np.linalg.inv(information + 1e-6 * np.eye(len(information)))
-    return inverse
+    return at, value, information + prior[2]

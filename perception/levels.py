@@ -32,7 +32,7 @@ class LevelConfig:
 
     nominal_db: float = 2.5
     highlight_db: float = 5.0
-    shadow_db: float = 7.0
+    shadow_db: float = 9.0
     change_cost: float = 4.5
 
 

@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 
 from perception.files import write_text
-from perception.records import FloatArray, IntArray
+from perception.records import BoolArray, FloatArray, IntArray
 
 _COLUMNS = ("easting_m", "northing_m", "kind", "height_m", "sigma_m", "slant_range_m",
-            "shadow_length_m", "pass", "ping")  # fmt: skip
+            "shadow_length_m", "pass", "ping", "probability", "bound")  # fmt: skip
+
+
+_TYPES = {"pass_index": np.int64, "ping": np.int64, "lower_bound": np.bool_}
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +32,8 @@ class ObjectTable:
         along the pass; `half_across_m`, `half_along_m` its half sizes at a tenth of the height;
         `shape` the exponent of the fitted profile (NaN where the plain shadow relation was used).
     gain : log likelihood over a flat floor.
+    probability : that it is an object (or crater) and not the floor's own relief.
+    lower_bound : the shadow runs out of the swath, and `height_m` is the least that it proves.
     """
 
     easting_m: FloatArray
@@ -46,6 +51,8 @@ class ObjectTable:
     half_along_m: FloatArray
     shape: FloatArray
     gain: FloatArray
+    probability: FloatArray
+    lower_bound: BoolArray
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -56,8 +63,11 @@ class ObjectTable:
         columns: dict[str, Any] = {}
         for f in fields(cls):
             values = [getattr(row, f.name) for row in rows]
-            whole = np.int64 if f.name in ("pass_index", "ping") else np.float64
-            columns[f.name] = tuple(values) if f.name == "kind" else np.array(values, dtype=whole)
+            columns[f.name] = (
+                tuple(values)
+                if f.name == "kind"
+                else np.array(values, dtype=_TYPES.get(f.name, float))
+            )
         return cls(**columns)
 
     @classmethod
@@ -91,6 +101,8 @@ class ObjectRow:
     half_along_m: float
     shape: float = field(default=float("nan"))
     gain: float = field(default=0.0)
+    probability: float = field(default=1.0)
+    lower_bound: bool = field(default=False)
 
 
 def write_objects_csv(path: Path, table: ObjectTable) -> None:
@@ -100,6 +112,7 @@ def write_objects_csv(path: Path, table: ObjectTable) -> None:
         lines.append(
             f"{table.easting_m[i]:.3f},{table.northing_m[i]:.3f},{table.kind[i]},"
             f"{table.height_m[i]:.3f},{table.sigma_m[i]:.3f},{table.slant_range_m[i]:.3f},"
-            f"{table.shadow_length_m[i]:.3f},{table.pass_index[i]},{table.ping[i]}"
+            f"{table.shadow_length_m[i]:.3f},{table.pass_index[i]},{table.ping[i]},"
+            f"{table.probability[i]:.3f},{'lower' if table.lower_bound[i] else ''}"
         )
     write_text(path, "\n".join(lines) + "\n")

@@ -21,7 +21,7 @@ from perception.contours import (
     level_lines,
 )
 from perception.gain import Equalised, GainConfig, equalise
-from perception.geometry import ground_range, progress_along, resample_rows
+from perception.geometry import progress_along, resample_rows
 from perception.levels import SHADOW, LevelConfig, Levels, segment_levels
 from perception.objects import ObjectConfig, ObjectRow, ObjectTable, Track, find_objects
 from perception.records import ElevationStrip, FloatArray, InputError, IntArray, Swath
@@ -118,14 +118,13 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
     level = BottomTrack(altitude_m, line_sigma, bottom.first_return_m, bottom.valid)
     track = Track(along_m, altitude_m, line_sigma, swath.easting_m, swath.northing_m,
                   swath.heading_rad, swath.ping)  # fmt: skip
-    floor_sigma = _floor_sigma(rough, sample_m, port.shape[1], altitude_m)
 
     def one_side(side: int, power: FloatArray) -> tuple[Equalised, Levels, list[ObjectRow]]:
         equalised = equalise(power, sample_m, bottom.first_return_m, altitude_m,
                              side * swath.roll_rad, config.gain)  # fmt: skip
         levels = segment_levels(equalised.ratio, equalised.looks, config.levels)
         found = find_objects(equalised.ratio, levels, sample_m, side, track, swath.pass_index,
-                             floor_sigma, config.objects)  # fmt: skip
+                             rough, config.objects)  # fmt: skip
         return equalised, levels, found
 
     # Both sides at once: the kernels let go of the interpreter's lock, and share nothing.
@@ -187,15 +186,6 @@ def _depth(swath: Swath) -> FloatArray:
         return np.zeros(len(depth))
     index = np.arange(len(depth))
     return np.interp(index, index[known], depth[known])
-
-
-def _floor_sigma(
-    rough: Roughness, sample_m: float, count: int, altitude_m: FloatArray
-) -> FloatArray:
-    """Return the 1-sigma (count,) of the floor at each slant sample against the floor below the sonar."""
-    slant = (np.arange(count) + 0.5) * sample_m
-    ground = np.nan_to_num(ground_range(slant, np.array(np.median(altitude_m))), nan=0.0)
-    return np.sqrt(rough.variogram(ground))
 
 
 def _strip(

@@ -137,7 +137,7 @@ def test_objects_csv_has_the_columns_of_the_contract(tmp_path: Path) -> None:
     rows = list(csv.DictReader((tmp_path / "objects.csv").open()))
     assert list(rows[0]) == [
         "easting_m", "northing_m", "kind", "height_m", "sigma_m", "slant_range_m",
-        "shadow_length_m", "pass", "ping",
+        "shadow_length_m", "pass", "ping", "probability", "bound",
     ]  # fmt: skip
     assert float(rows[0]["height_m"]) == pytest.approx(float(table.height_m[0]), abs=0.001)
     write_objects_csv(tmp_path / "none.csv", ObjectTable.of([]))
