@@ -267,10 +267,19 @@ def _read_band(source: Any, band: int, window: Window | None = None) -> npt.NDAr
     return filled
 
 
-def write_map(path: Path, grid: Grid, tags: Mapping[str, str] | None = None) -> None:
+def write_map(
+    path: Path,
+    grid: Grid,
+    tags: Mapping[str, str] | None = None,
+    filled: npt.NDArray[np.bool_] | None = None,
+) -> None:
     """Write `map.tif` as the contract has it: float32 bands elevation, sigma, count; NaN nodata.
 
     A grid without sigma or count gets bands of NaN, so that the bands' order never varies.
+
+    Parameters
+    ----------
+    filled : (rows, cols) where gaps were filled: a fourth band `filled`, 1 there.
     """
     nothing = np.full(grid.shape, np.nan)
     bands = {
@@ -278,6 +287,8 @@ def write_map(path: Path, grid: Grid, tags: Mapping[str, str] | None = None) -> 
         "sigma": nothing if grid.sigma_m is None else grid.sigma_m,
         "count": nothing if grid.count is None else grid.count,
     }
+    if filled is not None:
+        bands["filled"] = filled.astype(float)
     extra = {"VERTICAL_DATUM": grid.datum} if grid.datum else {}
     write_bands(path, bands, grid, tags={**extra, **(tags or {})})
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import netCDF4
 import numpy as np
+import numpy.typing as npt
 
 from mapping.fusion import map_window
 from mapping.gridding import Window
@@ -145,12 +146,23 @@ class TilePlan:
 
     def touching(self, tile: tuple[int, int]) -> list[int]:
         """Return the strips that a tile is made of, in order."""
-        outer = self.outer(tile)
-        return [
-            index
+        outer, (owner, row, col, rows, cols) = self.outer(tile), self._block_table
+        apart = (
+            (row >= outer.row + outer.rows) | (row + rows <= outer.row)
+            | (col >= outer.col + outer.cols) | (col + cols <= outer.col)
+        )  # fmt: skip
+        found: list[int] = np.unique(owner[~apart]).tolist()
+        return found
+
+    @cached_property
+    def _block_table(self) -> npt.NDArray[np.int64]:
+        """Strip, row, column, rows and columns (5, blocks) of all blocks: long surveys have very many."""
+        table = [
+            (index, box.row, box.col, box.rows, box.cols)
             for index, blocks in enumerate(self.boxes)
-            if any(box.common(outer) for _, _, box in blocks)
+            for _, _, box in blocks
         ]
+        return np.array(table, np.int64).reshape(-1, 5).T
 
     def key(self, tile: tuple[int, int]) -> str:
         """Return the digest of all that decides a tile's content."""

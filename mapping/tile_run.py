@@ -7,14 +7,14 @@ of all it came from. Tiles share nothing, so their number of makers and their or
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
 from mapping.tile_figures import tile_figures
 from mapping.tile_plan import TilePlan, load_plan, save_plan
-from mapping.tile_store import TileStore
+from mapping.tile_store import FILLED, FUSED, TileStore
 from mapping.tiles import fuse_tile
 from perception.files import existing_file
 from perception.records import BathynavError, Progress, silent
@@ -48,49 +48,60 @@ def fuse_tiles(
         The cluster went away; the same call goes on where it stopped.
     """
     store = TileStore.create(folder, plan)
-    tiles, keys = plan.tiles(), {tile: plan.key(tile) for tile in plan.tiles()}
-    missing = _missing(store, keys)
+    keys = {tile: plan.key(tile) for tile in plan.tiles()}
     path = Path(folder).absolute() / "plan.npz"
     save_plan(path, plan)
     stamp = existing_file(path).stat().st_mtime_ns
-    makers = _here if client is None else functools.partial(_on_cluster, client)
-    done = len(tiles) - len(missing)
-    progress("fusing tiles", done, len(tiles))
     work = functools.partial(make_tile, str(path), stamp)
-    for _ in makers(work, [(tile, keys[tile]) for tile in missing]):
+    figures, made = run_tiles(store, keys, work, FUSED, client, progress)
+    return store, figures, made
+
+
+def run_tiles(
+    store: TileStore,
+    keys: Mapping[Tile, str],
+    work: Callable[[Tile, str], Tile],
+    stage: str,
+    client: Any,
+    progress: Progress,
+) -> tuple[list[dict[str, Any]], int]:
+    """Do a stage's work on every tile that is not marked with its key; return all figures and how many."""
+    missing = [(tile, key) for tile, key in keys.items() if store.figures(tile, key, stage) is None]
+    makers = _here if client is None else functools.partial(_on_cluster, client)
+    label = {FUSED: "fusing tiles", FILLED: "filling gaps"}[stage]
+    done = len(keys) - len(missing)
+    progress(label, done, len(keys))
+    for _ in makers(work, missing):
         done += 1
-        progress("fusing tiles", done, len(tiles))
-    figures = [store.figures(tile, keys[tile]) or {} for tile in tiles]
-    return store, figures, len(missing)
+        progress(label, done, len(keys))
+    return [store.figures(tile, key, stage) or {} for tile, key in keys.items()], len(missing)
 
 
 def tiles_to_make(plan: TilePlan, folder: Path) -> int:
     """Return how many tiles of a plan a folder lacks: few are not worth a cluster."""
     store = TileStore.create(folder, plan)
-    return len(_missing(store, {tile: plan.key(tile) for tile in plan.tiles()}))
-
-
-def _missing(store: TileStore, keys: dict[Tile, str]) -> list[Tile]:
-    return [tile for tile, key in keys.items() if store.figures(tile, key) is None]
+    return sum(store.figures(tile, plan.key(tile)) is None for tile in plan.tiles())
 
 
 def make_tile(plan_path: str, stamp: int, tile: Tile, key: str) -> Tile:
     """Make one tile, write it and mark it; the function that workers call."""
-    plan = _plan_of(plan_path, stamp)
+    plan = plan_of(plan_path, stamp)
     layers = fuse_tile(plan, tile)
-    store = _store_of(str(Path(plan_path).parent), stamp)
+    store = store_of(str(Path(plan_path).parent), stamp)
     store.write(plan.slices(tile), layers)
     store.mark(tile, key, tile_figures(layers))
     return tile
 
 
 @functools.lru_cache(maxsize=1)
-def _plan_of(path: str, stamp: int) -> TilePlan:
+def plan_of(path: str, stamp: int) -> TilePlan:
+    """Return a plan, read once by each process; `stamp` tells it from an earlier one of that name."""
     return load_plan(Path(path))
 
 
 @functools.lru_cache(maxsize=1)
-def _store_of(folder: str, stamp: int) -> TileStore:
+def store_of(folder: str, stamp: int) -> TileStore:
+    """Return the store in a folder, opened once by each process."""
     return TileStore(Path(folder))
 
 

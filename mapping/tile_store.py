@@ -23,13 +23,18 @@ from mapping.tiles import LAYERS, Layers
 from perception.files import write_text
 from perception.records import InputError
 
-# layer: (units, long name, CF standard name)
+# layer: (units, long name, CF standard name); heights of filled cells lie apart from data.
 _ATTRIBUTES = {
     "elevation": ("m", "height of the sea floor above the vertical datum", ""),
     "sigma": ("m", "1-sigma of the cell's mean height", ""),
     "count": ("1", "number of data", ""),
     "echo": ("dB", "echo level over nominal", ""),
+    "fill": ("m", "height of filled cells, which hold no data", ""),
+    "fill_sigma": ("m", "1-sigma of filled cells", ""),
 }
+FILL_LAYERS = ("fill", "fill_sigma")
+# A store's marks by stage: tiles fused, tiles filled.
+FUSED, FILLED = "marks", "fill-marks"
 
 
 class TileStore:
@@ -61,7 +66,7 @@ class TileStore:
             The disk is full or may not be written.
         """
         try:
-            for name in LAYERS:
+            for name in LAYERS if layers is None else layers:
                 array: Any = self._group[name]
                 array[where] = array.fill_value if layers is None else layers[name]
         except OSError as error:
@@ -72,26 +77,29 @@ class TileStore:
         array: Any = self._group[name]
         return np.asarray(array[where], np.float32)
 
-    def mark(self, tile: tuple[int, int], key: str, figures: Mapping[str, Any]) -> None:
+    def mark(
+        self, tile: tuple[int, int], key: str, figures: Mapping[str, Any], stage: str = FUSED
+    ) -> None:
         """Note that a tile's chunks are written."""
-        write_text(self._mark(tile), json.dumps({"key": key, "figures": dict(figures)}) + "\n")
+        said = {"key": key, "figures": dict(figures)}
+        write_text(self._mark(tile, stage), json.dumps(said) + "\n")
 
-    def figures(self, tile: tuple[int, int], key: str) -> dict[str, Any] | None:
+    def figures(self, tile: tuple[int, int], key: str, stage: str = FUSED) -> dict[str, Any] | None:
         """Return a tile's figures; None where it is not there as the key has it."""
         try:
-            said = json.loads(self._mark(tile).read_text(encoding="utf-8"))
+            said = json.loads(self._mark(tile, stage).read_text(encoding="utf-8"))
         except (FileNotFoundError, ValueError):
             return None
         figures: dict[str, Any] | None = said["figures"] if said.get("key") == key else None
         return figures
 
-    def _mark(self, tile: tuple[int, int]) -> Path:
-        return self.folder / "marks" / f"{tile[0]}-{tile[1]}.json"
+    def _mark(self, tile: tuple[int, int], stage: str) -> Path:
+        return self.folder / stage / f"{tile[0]}-{tile[1]}.json"
 
 
 def clear(folder: Path) -> None:
     """Remove a store's tiles and marks."""
-    for name in ("marks", "map.zarr"):
+    for name in (FUSED, FILLED, "map.zarr"):
         shutil.rmtree(Path(folder) / name, ignore_errors=True)
 
 
@@ -111,7 +119,7 @@ def _create(path: Path, plan: TilePlan, frame: list[Any]) -> None:
     try:
         # The frame is written last: a store that was being made when the run was killed is made anew.
         group = zarr.open_group(str(path), mode="w")
-        for name in LAYERS:
+        for name in (*LAYERS, *FILL_LAYERS):
             units, long_name, _ = _ATTRIBUTES[name]
             group.create_array(
                 name, shape=plan.shape, chunks=(plan.tile_cells, plan.tile_cells), dtype="float32",

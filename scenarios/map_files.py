@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from mapping.cog import Frame, Slices, write_cog
 from mapping.compare import Difference, difference, write_changes
+from mapping.fill import fill_map
 from mapping.mosaic import echo_mosaic, write_mosaic
 from mapping.objects import merge_objects, write_objects
 from mapping.pose_graph_files import write_graph
@@ -25,6 +26,9 @@ from mapping.quality import (
 from mapping.rasters import write_map
 from mapping.round_files import write_rounds
 from mapping.survey import CorrectedSurvey
+from mapping.tile_figures import map_figures, tile_figures
+from mapping.tile_fill import with_fill
+from mapping.tile_store import FILL_LAYERS
 from mapping.tracks import write_tracks
 from mapping.trajectories import from_true_north, write_trajectory
 from perception.files import whole_file
@@ -63,21 +67,28 @@ def tie_to_prior(grid: Grid, old: Grid) -> Tie:
 
 
 def write_whole(
-    out: Path, survey: Survey, result: SurveyMap, tie: Tie | None = None
+    out: Path,
+    survey: Survey,
+    result: SurveyMap,
+    tie: Tie | None = None,
+    fill_m: float | None = None,
 ) -> dict[str, Any]:
-    """Write the folder of a map in one piece; return its metrics."""
+    """Write the folder of a map in one piece, gaps filled up to `fill_m` from data; return its metrics."""
     grid = result.grid
     if tie is not None:
         grid = replace(grid, elevation_m=grid.elevation_m + tie.shift_m, datum=tie.datum)
-    write_map(out / "map.tif", grid)
+    drawn, filled = (grid, None) if fill_m is None else fill_map(grid, fill_m)
+    write_map(out / "map.tif", drawn, filled=filled)
     mosaic = echo_mosaic(result.corrected.strips, grid.cell_m, survey.crs)
     write_mosaic(out / "mosaic.tif", mosaic)
-    _write_pictures(out, grid, mosaic, result.raw_track, result.track)
+    _write_pictures(out, drawn, mosaic, result.raw_track, result.track)
     pings = [summary.strip.ping for summary in result.passes]
     shared = _write_shared(out, survey, result, pings, tie)
     seen = np.isfinite(grid.elevation_m)
+    number = None if filled is None else int(filled.sum())
     return (
         shared
+        | _fill_figures(number, grid.cell_m * grid.cell_north_m)
         | {
             "cell_m": grid.cell_m,
             "cells": int(seen.sum()),
@@ -90,6 +101,11 @@ def write_whole(
         }
         | survey_quality(result.corrected.strips, grid, result.track)
     )
+
+
+def _fill_figures(cells: int | None, cell_m2: float) -> dict[str, Any]:
+    """Return how much was filled; nothing where that was not asked for. All other figures are of data."""
+    return {} if cells is None else {"filled_cells": cells, "filled_m2": cells * cell_m2}
 
 
 def write_tiled(
@@ -105,6 +121,8 @@ def write_tiled(
     datum = plan.datum if tie is None else tie.datum
     frame = Frame(plan.west_m, plan.north_m, plan.cell_m, plan.shape, plan.crs, datum)
 
+    tied: list[dict[str, Any]] = []
+
     def windows(*names: str) -> Iterator[tuple[Slices, dict[str, npt.NDArray[Any]]]]:
         tiles = plan.tiles()
         for done, tile in enumerate(tiles, start=1):
@@ -112,11 +130,17 @@ def write_tiled(
             layers = {name: store.read(name, where) for name in names}
             if "elevation" in layers:
                 layers["elevation"] = layers["elevation"] + np.float32(shift_m)
+                if tie is not None:  # depths are not what they were when the tile was made
+                    tied.append(tile_figures(layers))
+                if result.filled is not None:
+                    fill, fill_sigma = (store.read(name, where) for name in FILL_LAYERS)
+                    layers = with_fill(layers, fill + np.float32(shift_m), fill_sigma)
             yield where, layers
             progress("tiles to raster", done, len(tiles))
 
     bands = ("elevation", "sigma", "count")
-    write_cog(out / "map.tif", frame, bands, windows(*bands))
+    extra = () if result.filled is None else ("filled",)
+    write_cog(out / "map.tif", frame, (*bands, *extra), windows(*bands))
     echoes = ((where, {"echo_db": layers["echo"]}) for where, layers in windows("echo"))
     write_cog(out / "mosaic.tif", frame, ("echo_db",), echoes)
     grid = result.overview()
@@ -124,14 +148,13 @@ def write_tiled(
     _write_pictures(out, grid, result.overview("echo"), result.raw_track, result.track)
     pings = [strip.ping for strip in result.strips]
     shared = _write_shared(out, survey, result, pings, tie)
-    return shared | _tiled_figures(result, shift_m)
+    figures = map_figures(tied, plan.shape[0] * plan.shape[1], plan.cell_m) if tied else None
+    filled = _fill_figures(result.filled, plan.cell_m**2)
+    return shared | filled | _tiled_figures(result, figures or result.figures)
 
 
-def _tiled_figures(result: TiledSurvey, shift_m: float) -> dict[str, Any]:
+def _tiled_figures(result: TiledSurvey, figures: dict[str, Any]) -> dict[str, Any]:
     """Return the map's figures from its tiles', named as those of a map in one piece."""
-    figures = dict(result.figures)
-    for key in ("elevation_min_m", "elevation_max_m"):
-        figures[key] += shift_m
     horizontal_m = horizontal_95(result.track)
     shares = {order: figures[f"s44_{order}_vertical_share"] for order in S44_ORDERS}
     met = order_met(shares, figures["depth_median_m"], horizontal_m)

@@ -22,9 +22,10 @@ from mapping.placed import PlacedStrip, position_variance
 from mapping.survey import CorrectedSurvey, SurveyConfig, correct_survey
 from mapping.textures import MatchConfig
 from mapping.tile_figures import map_figures
+from mapping.tile_fill import fill_tiles, with_fill
 from mapping.tile_plan import TILE_CELLS, TilePlan, filed, plan_tiles
 from mapping.tile_run import fuse_tiles, tiles_to_make
-from mapping.tile_store import TileStore
+from mapping.tile_store import FILL_LAYERS, TileStore
 from perception.objects import ObjectTable
 from perception.readers import Survey
 from perception.records import ElevationStrip, Grid, Progress, Trajectory, silent
@@ -49,6 +50,7 @@ class TiledSurvey:
     Attributes
     ----------
     plan, store : the tiles; `figures` of the whole map, `made` tiles that this run made.
+    filled : cells whose gaps were filled; None where that was not asked for.
     track, raw_track, corrected, objects : as in `SurveyMap`; the strips of `corrected` are coarse.
     """
 
@@ -60,6 +62,7 @@ class TiledSurvey:
     raw_track: Trajectory
     corrected: CorrectedSurvey
     objects: tuple[ObjectTable, ...]
+    filled: int | None = None
 
     @property
     def strips(self) -> tuple[ElevationStrip, ...]:
@@ -72,6 +75,9 @@ class TiledSurvey:
         layers = {name: _thin(self.plan, self.store, name, step)}
         if name == "elevation":
             layers["sigma"] = _thin(self.plan, self.store, "sigma", step)
+            if self.filled is not None:
+                fill = (_thin(self.plan, self.store, layer, step) for layer in FILL_LAYERS)
+                layers = with_fill(layers, *fill)
         return Grid(
             layers[name].astype(float), self.plan.west_m, self.plan.north_m, step * self.plan.cell_m,
             self.plan.crs, layers.get("sigma"), datum=self.plan.datum,
@@ -96,6 +102,7 @@ def map_tiles(
     fixes: Sequence[PositionFix] = (),
     cell_m: float | None = None,
     tile_cells: int = TILE_CELLS,
+    fill_m: float | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
     progress: Progress = silent,
@@ -104,6 +111,7 @@ def map_tiles(
 
     Parameters
     ----------
+    fill_m : fill gaps up to this far from data; None leaves them.
     folder : where strips and tiles are kept; a later call with the same survey and settings goes on there.
     scheduler : address of a Dask cluster that sees `folder`; None starts a local one of `workers`.
     """
@@ -124,6 +132,9 @@ def map_tiles(
     alone = scheduler is None and tiles_to_make(plan, folder) <= _TILES_MADE_HERE
     with nullcontext() if alone else open_cluster(scheduler, workers) as client:
         store, tiles, made = fuse_tiles(plan, folder, client, progress)
+        filled = None
+        if fill_m is not None:
+            filled = fill_tiles(plan, store, fill_m, client, progress)
     raw = navigated_track(survey)
     return TiledSurvey(
         plan=plan,
@@ -134,6 +145,7 @@ def map_tiles(
         raw_track=raw,
         corrected=corrected,
         objects=tuple(corrected_objects(one.objects, raw, track) for one in passes),
+        filled=filled,
     )
 
 

@@ -64,6 +64,13 @@ class _Tiling:
     help="All echoes jointly (default), or heights from shadows alone (always so in tiles).",
 )
 @click.option(
+    "--fill",
+    "fill_m",
+    type=click.FloatRange(min=0, min_open=True, max=1000),
+    callback=_finite,
+    help="Fill gaps up to so many metres from data, marked in a band `filled`.",
+)
+@click.option(
     "--also",
     multiple=True,
     metavar="NAME.nc|.grd|.bag|.asc",
@@ -93,6 +100,7 @@ def command(
     tide: Path | None,
     sound_speed: str | None,
     method: str | None,
+    fill_m: float | None,
     also: tuple[str, ...],
     tiles: bool,
     tile_cells: int,
@@ -132,15 +140,15 @@ def command(
         tiling = _Tiling(tiles, tile_cells, scheduler, workers)
         method, in_tiles = _choose(survey, cell, method, tiling, quiet)
         if in_tiles:
-            metrics = _in_tiles(out, survey, absolute, cell, tiling, old, progress)
+            metrics = _in_tiles(out, survey, absolute, cell, tiling, old, fill_m, progress)
         else:
-            metrics = _in_one_piece(out, survey, absolute, cell, method, old, progress)
+            metrics = _in_one_piece(out, survey, absolute, cell, method, old, fill_m, progress)
         _export(out, also)
     config = {
         "surveys": [str(p) for p in surveys], "cell_m": cell, "crs": survey.crs, "method": method,
         "prior": prior, "fixes": fixes, "install": install, "tide": tide,
         "sound_speed": sound_speed, "tile_cells": tile_cells if in_tiles else None,
-        "also": list(also) or None,
+        "also": list(also) or None, "fill_m": fill_m,
     }  # fmt: skip
     metrics["seconds"] = time.perf_counter() - began
     write_metrics(out, metrics, config)
@@ -203,6 +211,7 @@ def _in_one_piece(
     cell_m: float | None,
     method: str,
     old: Grid | None,
+    fill_m: float | None,
     progress: Progress,
 ) -> dict[str, Any]:
     from scenarios.map_files import tie_to_prior, write_whole
@@ -213,7 +222,7 @@ def _in_one_piece(
     )
     # Tied before anything is written: every file of the folder is of one height.
     tie = None if old is None else tie_to_prior(result.grid, old)
-    return write_whole(out, survey, result, tie) | ({} if tie is None else tie.metrics())
+    return write_whole(out, survey, result, tie, fill_m) | ({} if tie is None else tie.metrics())
 
 
 def _in_tiles(
@@ -223,6 +232,7 @@ def _in_tiles(
     cell_m: float | None,
     tiling: _Tiling,
     old: Grid | None,
+    fill_m: float | None,
     progress: Progress,
 ) -> dict[str, Any]:
     from scenarios.map_files import tie_to_prior, write_tiled
@@ -230,7 +240,7 @@ def _in_tiles(
 
     result = map_tiles(
         survey, out / "tiles", fixes=fixes, cell_m=cell_m, tile_cells=tiling.tile_cells,
-        scheduler=tiling.scheduler, workers=tiling.workers, progress=progress,
+        fill_m=fill_m, scheduler=tiling.scheduler, workers=tiling.workers, progress=progress,
     )  # fmt: skip
     tie = None if old is None else tie_to_prior(result.overview(), old)
     return write_tiled(out, survey, result, tie, progress) | ({} if tie is None else tie.metrics())

@@ -189,3 +189,31 @@ def test_the_store_opens_as_a_labelled_data_set(tmp_path: Path) -> None:
     assert float(data["x"][1] - data["x"][0]) == 1.0 and float(data["y"][0]) > float(data["y"][1])
     assert data["crs"].attrs["grid_mapping_name"] == "transverse_mercator"
     assert json.dumps(data.attrs["frame"])
+
+
+def test_gaps_are_filled_in_tiles_as_in_one_piece(tmp_path: Path) -> None:
+    from mapping.fill import fill_gaps, learn_variogram
+    from mapping.tile_fill import fill_tiles
+
+    strips, track = a_survey(np.random.default_rng(7))
+    plan = a_plan(tmp_path, strips, track, 0.5, 1000)
+    store, _, _ = fuse_tiles(plan, tmp_path / "one")
+    height, sigma = whole(store, "elevation", plan), whole(store, "sigma", plan)
+    number = fill_tiles(plan, store, 4.0)
+    variogram = learn_variogram([height], 0.5, 4.0)
+    expected = fill_gaps(height.astype(float), sigma.astype(float), 0.5, 4.0, variogram)
+    one = whole(store, "fill", plan)
+    np.testing.assert_array_equal(one, expected[0].astype(np.float32))
+    assert (
+        number == np.isfinite(one).sum() > 100
+        and not (np.isfinite(one) & np.isfinite(height)).any()
+    )
+    # Small tiles learn from the same cells but those at their edges: nearly the same variogram.
+    many = replace(plan, tile_cells=100)
+    store, _, _ = fuse_tiles(many, tmp_path / "many")
+    fill_tiles(many, store, 4.0)
+    part = whole(store, "fill", many)
+    np.testing.assert_array_equal(np.isfinite(part), np.isfinite(one))
+    spread = whole(store, "fill_sigma", many)
+    assert np.nanmax(np.abs(part - one) / spread) < 0.25
+    assert fill_tiles(many, store, 4.0) == number
