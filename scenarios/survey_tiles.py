@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from mapping.compare import same_frame
 from mapping.fixes import PositionFix
-from mapping.fusion import default_cell
+from mapping.fusion import default_cell, fuse
 from mapping.placed import PlacedStrip, position_variance
-from mapping.survey import CorrectedSurvey, SurveyConfig, correct_survey
+from mapping.survey import CorrectedSurvey, SurveyConfig, correct_survey, tie_to_map
 from mapping.textures import MatchConfig
 from mapping.tile_figures import map_figures
 from mapping.tile_fill import fill_tiles, with_fill
@@ -100,6 +101,7 @@ def map_tiles(
     folder: Path,
     *,
     fixes: Sequence[PositionFix] = (),
+    prior: Grid | None = None,
     cell_m: float | None = None,
     tile_cells: int = TILE_CELLS,
     fill_m: float | None = None,
@@ -111,6 +113,7 @@ def map_tiles(
 
     Parameters
     ----------
+    prior : a map to tie the track to, by a draft of this survey of few enough cells to hold.
     fill_m : fill gaps up to this far from data; None leaves them.
     folder : where strips and tiles are kept; a later call with the same survey and settings goes on there.
     scheduler : address of a Dask cluster that sees `folder`; None starts a local one of `workers`.
@@ -121,6 +124,8 @@ def map_tiles(
         match=MatchConfig(cell_m=float(np.median([one.cell_m for one in passes])))
     )
     corrected = correct_survey(thin, fixes, config, progress=progress)
+    if prior is not None:
+        corrected = _tied_in_the_plane(survey, thin, corrected, prior)
     track = whole_track(survey, corrected.trajectory)
     cell = cell_m or default_cell([_columns(one) for one in passes])
     strips = [
@@ -147,6 +152,16 @@ def map_tiles(
         objects=tuple(corrected_objects(one.objects, raw, track) for one in passes),
         filled=filled,
     )
+
+
+def _tied_in_the_plane(
+    survey: Survey, strips: Sequence[ElevationStrip], corrected: CorrectedSurvey, prior: Grid
+) -> CorrectedSurvey:
+    east_m, north_m = expected_size(survey)
+    cell_m = max(default_cell(strips), float(np.sqrt(east_m * north_m / _PICTURE_CELLS)))
+    draft = fuse(corrected.strips, cell_m, survey.crs, corrected.trajectory)
+    same_frame(draft, prior)
+    return tie_to_map(strips, corrected, draft, prior)
 
 
 def _columns(one: FiledPass) -> ElevationStrip:

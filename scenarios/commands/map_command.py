@@ -239,7 +239,7 @@ def _in_tiles(
     from scenarios.survey_tiles import map_tiles
 
     result = map_tiles(
-        survey, out / "tiles", fixes=fixes, cell_m=cell_m, tile_cells=tiling.tile_cells,
+        survey, out / "tiles", fixes=fixes, prior=old, cell_m=cell_m, tile_cells=tiling.tile_cells,
         fill_m=fill_m, scheduler=tiling.scheduler, workers=tiling.workers, progress=progress,
     )  # fmt: skip
     tie = None if old is None else tie_to_prior(result.overview(), old)
