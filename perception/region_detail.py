@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
+from scipy import ndimage
 
 from perception.box_fit import box_derivatives
 from perception.curvature import Curvature, Operator, curvature_of
@@ -23,7 +24,7 @@ from perception.scale import smooth, upsample
 
 # Regions are of use from about this many cells on: a dozen on a side. Rough terrain segmented at its own finest
 # scale gives 20 to 60, hills and dunes that a map resolves give 400 and more (half the classed area each).
-_USEFUL_CELLS = 144
+USEFUL_CELLS = 144
 # With fewer regions than this nobody asks for fewer.
 _FEW = 30
 # Cells from one node of the noise map to the next.
@@ -31,8 +32,8 @@ _STEP = 8
 # No map is thinned below this many cells on its longer side.
 _LEAST_SIDE = 32
 # Above this many cells the level is chosen on tiles of so many cells a side, where most is known.
-_WHOLE_CELLS = 600_000
-_TILE = 320
+_WHOLE_CELLS = 300_000
+_TILE = 256
 _TILES = 4
 
 
@@ -139,56 +140,49 @@ def _block_means(z: npt.NDArray[Any], thinning: int, means: npt.NDArray[np.float
 
 def _spread(coarse: Curvature, thinning: int, grid: Grid) -> Curvature:
     """Interpolate a thinned map's curvature to the cells of the map; NaN where it has no height."""
+    planes = (coarse.H, coarse.K, coarse.sigma_H, coarse.sigma_K, coarse.scale_m)
+    nodes = np.stack([_filled(np.asarray(plane, np.float64)) for plane in planes])
+    out = np.empty((5, *grid.shape), np.float32)
+    _between_nodes(nodes, grid.elevation_m, thinning, out)
+    # Nobody asks a level for its noise: one number stands for it.
+    noise = np.broadcast_to(np.float32(np.nanmedian(coarse.noise_m)), grid.shape)
+    return Curvature(out[0], out[1], out[2], out[3], out[4], noise)
 
-    def fine(values: FloatArray) -> FloatArray:
-        out = np.empty(grid.shape, np.float32)
-        _between_nodes(values, grid.elevation_m, thinning, out)
-        return out
 
-    return Curvature(
-        fine(coarse.H),
-        fine(coarse.K),
-        fine(coarse.sigma_H),
-        fine(coarse.sigma_K),
-        fine(coarse.scale_m),
-        fine(coarse.noise_m),
-    )
+def _filled(values: FloatArray) -> FloatArray:
+    """Fill what is missing from the nearest that is known."""
+    missing = np.isnan(values)
+    if not missing.any() or missing.all():
+        return values
+    nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
+    filled: FloatArray = values[tuple(nearest)]
+    return filled
 
 
 @njit(cache=True, parallel=True)
 def _between_nodes(
-    nodes: npt.NDArray[Any],
+    nodes: npt.NDArray[np.float64],
     z: npt.NDArray[Any],
     thinning: int,
     out: npt.NDArray[np.float32],
 ) -> None:
-    """Interpolate bilinearly between the centres of blocks, missing ones left out; NaN where z is."""
-    rows, cols = nodes.shape
-    for i in prange(out.shape[0]):
+    """Interpolate planes bilinearly between the centres of blocks; NaN where z is."""
+    count, rows, cols = nodes.shape
+    for i in prange(z.shape[0]):
         a = min(max((i + 0.5) / thinning - 0.5, 0.0), rows - 1.0)
         top = int(a)
         low = min(top + 1, rows - 1)
         a -= top
-        for j in range(out.shape[1]):
-            if np.isnan(z[i, j]):
-                out[i, j] = np.nan
-                continue
-            b = min(max((j + 0.5) / thinning - 0.5, 0.0), cols - 1.0)
-            left = int(b)
-            right = min(left + 1, cols - 1)
-            b -= left
-            total, weight = 0.0, 0.0
-            for m, n, w in (
-                (top, left, (1 - a) * (1 - b)),
-                (top, right, (1 - a) * b),
-                (low, left, a * (1 - b)),
-                (low, right, a * b),
-            ):
-                if not np.isnan(nodes[m, n]):
-                    total += w * nodes[m, n]
-                    weight += w
-            # The cell's own block is known where the cell is, with a quarter of the weight at least.
-            out[i, j] = total / weight
+        for k in range(count):
+            line = nodes[k, top] * (1 - a) + nodes[k, low] * a
+            fine = out[k, i]
+            for j in range(len(fine)):
+                b = min(max((j + 0.5) / thinning - 0.5, 0.0), cols - 1.0)
+                left = int(b)
+                b -= left
+                fine[j] = line[left] * (1 - b) + line[min(left + 1, cols - 1)] * b
+                if np.isnan(z[i, j]):
+                    fine[j] = np.nan
 
 
 def tiles(grid: Grid) -> list[Grid]:
@@ -216,18 +210,26 @@ def _lattice(grid: Grid) -> Iterator[Grid]:
         yield replace(grid, elevation_m=grid.elevation_m[window], sigma_m=sigma_m, count=None)
 
 
-def useful(sizes: list[npt.NDArray[np.floating[Any]]]) -> bool:
-    """Return whether half of the classed area lies in regions of a useful size.
+def typical_cells(sizes: list[npt.NDArray[np.floating[Any]]]) -> float:
+    """Return the size of region, in cells, that half of the classed area lies at or above.
 
     Parameters
     ----------
-    sizes : for each tile the cells of its regions that are not flat.
+    sizes : for each tile the cells of its regions that are not flat. A few regions are no crowd: infinite.
     """
     cells = np.sort(np.concatenate(sizes))
     if len(cells) < _FEW:
-        return True
+        return float("inf")
     running = np.cumsum(cells)
-    return bool(cells[np.searchsorted(running, running[-1] / 2)] >= _USEFUL_CELLS)
+    return float(cells[np.searchsorted(running, running[-1] / 2)])
+
+
+def next_level(typical: float) -> int:
+    """Return by how many doublings of the scale regions of a useful size are expected; 0 they are."""
+    if typical >= USEFUL_CELLS:
+        return 0
+    # On rough ground a region's area goes with the square of the scale it is seen at.
+    return int(np.ceil(0.5 * np.log2(USEFUL_CELLS / typical)))
 
 
 def candidates(grid: Grid) -> list[float]:

@@ -28,7 +28,14 @@ from perception.records import (
     silent,
 )
 from perception.region_classes import classify
-from perception.region_detail import box_curvature, candidates, curvature_at, tiles, useful
+from perception.region_detail import (
+    box_curvature,
+    candidates,
+    curvature_at,
+    next_level,
+    tiles,
+    typical_cells,
+)
 from perception.region_graph import region_table
 from perception.region_labels import (
     COUNT,
@@ -149,7 +156,9 @@ def segment(
     if detail_m > 0:
         read = curvature_at(grid, config.scale_m, detail_m, config.operator)
     finest = _regions(grid, read, config)
-    base_m = max(float(np.nanmedian(read.scale_m)), np.sqrt(grid.cell_m * grid.cell_north_m))
+    base_m = max(
+        float(np.nanmedian(read.scale_m)), detail_m, np.sqrt(grid.cell_m * grid.cell_north_m)
+    )
     del read
     progress("regions", 3, steps)
     coarser: list[RegionMap] = []
@@ -174,15 +183,19 @@ def _detail(grid: Grid, config: RegionConfig) -> float:
     trial = replace(config, keep_probability=False)
     shown = tiles(grid)
     scales = candidates(grid)
-    for least_m in scales:
+    level = 0
+    while level < len(scales) - 1:
         sizes = []
         for tile in shown:
-            regions = _regions(tile, curvature_at(tile, None, least_m, config.operator), trial)
+            read = curvature_at(tile, None, scales[level], config.operator)
+            regions = _regions(tile, read, trial)
             area_m2, code = regions.table["area_m2"], regions.table["class_code"]
             sizes.append(area_m2[code != _FLAT] / (grid.cell_m * grid.cell_north_m))
-        if useful(sizes):
-            return least_m
-    return scales[-1]
+        step = next_level(typical_cells(sizes))
+        if step == 0:
+            break
+        level = min(level + step, len(scales) - 1)
+    return scales[level]
 
 
 def _regions(grid: Grid, curvature: Curvature, config: RegionConfig) -> RegionMap:
