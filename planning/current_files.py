@@ -48,6 +48,10 @@ def read_currents(text: str, grid: Grid) -> Currents:
             return _turned(steady(float(parts[0]), float(parts[1])), grid)
         except ValueError:
             pass
+    if not Path(text).exists():
+        raise InputError(
+            f"{text}: is neither EAST,NORTH in m/s nor a file; give e.g. --currents 0.2,-0.1"
+        )
     path = existing_file(Path(text))
     x, y, east, north, degrees = (
         _from_netcdf(path) if path.suffix.lower() in (".nc", ".nc4", ".cdf") else _from_raster(path)

@@ -116,5 +116,5 @@ def test_a_file_that_holds_no_currents_says_what_is_missing(tmp_path):
     xarray.Dataset({"temp": (("x", "y"), np.zeros((3, 3)))}).to_netcdf(tmp_path / "t.nc")
     with pytest.raises(InputError, match="has no current among temp"):
         read_currents(str(tmp_path / "t.nc"), grid_of(flat()))
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match="neither EAST,NORTH in m/s nor a file"):
         read_currents("0.1;0.2", grid_of(flat()))
