@@ -147,11 +147,14 @@ def stencil(z: npt.NDArray[Any], i: int, j: int, box: npt.NDArray[Any]) -> None:
         for b in (0, 2):
             if np.isnan(box[a, b]):
                 # The twist term from the opposite corner where there is one: exact for quadratics.
-                opposite = box[2 - a, 2 - b]
-                if np.isnan(opposite):
-                    box[a, b] = box[a, 1] + box[1, b] - box[1, 1]
-                else:
-                    box[a, b] = opposite + (box[a, 1] - box[2 - a, 1]) + (box[1, b] - box[1, 2 - b])
+                # In a corner, whose opposite is missing too, from a quadrant beside, where it turns sign.
+                plain = box[a, 1] + box[1, b] - box[1, 1]
+                twist = box[2 - a, 2 - b] - box[2 - a, 1] - box[1, 2 - b] + box[1, 1]
+                if np.isnan(twist):
+                    twist = box[2 - a, 1] + box[1, b] - box[2 - a, b] - box[1, 1]
+                if np.isnan(twist):
+                    twist = box[a, 1] + box[1, 2 - b] - box[a, 2 - b] - box[1, 1]
+                box[a, b] = plain if np.isnan(twist) else plain + twist
 
 
 @njit(cache=True, parallel=True)
