@@ -127,7 +127,7 @@ def write_cog(
                 target.update_tags(**datum, **dict(tags or {}))
             progress("writing the raster", 0, 1)
             rasterio.shutil.copy(
-                draft, temporary, driver="COG", compress="deflate", predictor="yes", level="4",
+                draft, temporary, driver="COG", compress="deflate", predictor="yes", level="2",
                 overview_resampling="average", bigtiff="if_safer", num_threads="2",
             )  # fmt: skip
             progress("writing the raster", 1, 1)

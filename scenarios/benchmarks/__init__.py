@@ -16,6 +16,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "echoes": ("echoes", "echoes to strips: pings a minute, heights of objects against truth"),
     "mapping": ("mapping", "one map from many passes: registration, pose graph, gridding, peers"),
     "crossed": ("crossed", "three and three crossed passes that drift, echoes to map and track"),
+    "gridding": ("gridding", "ten million soundings into cells, beside bincount, verde and GMT"),
     "tiles": ("tiles", "a map that outgrows memory: memory against size, the slowest step"),
     "simulation": ("simulation", "side-scan simulation: pings a second, beside plain numpy"),
     "navigation-matching": (
