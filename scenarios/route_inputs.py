@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+# The band of `locate --observability` that planning takes.
+_EXPECTED = "sigma_mean"
+
 
 @dataclass(frozen=True, slots=True)
 class Given:
@@ -184,9 +187,13 @@ def position_sigma(path: Path | None) -> Callable[[Grid], FloatArray | None]:
         return lambda grid: None
     import numpy as np
 
-    from mapping.rasters import read_map
+    from mapping.rasters import open_map
 
-    raster = read_map(path)
+    with open_map(path) as opened:
+        names = [name or "" for name in opened.source.descriptions]
+        # An observability map has a band for every heading: what counts is their mean.
+        band = names.index(_EXPECTED) + 1 if _EXPECTED in names else opened.elevation_band
+        raster = replace(opened, elevation_band=band, down=False).read_whole()
 
     def on(grid: Grid) -> FloatArray | None:
         sampled = raster.sample(*np.meshgrid(*grid.centres()))

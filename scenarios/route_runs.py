@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from perception.records import InputError, NoPathError
 from scenarios.commands.console import print_table
 from scenarios.outputs import write_metrics
-from scenarios.route_inputs import Given, read_around, read_asked
+from scenarios.route_inputs import Given, from_true_north, read_around, read_asked
 from scenarios.route_outputs import (
     figures,
     tell_route,
@@ -182,7 +182,9 @@ def replanned(run: Run) -> None:
         max(e, rest[:, 0].max()), max(n, rest[:, 1].max()),
     )  # fmt: skip
     problem = read_around(given, run.limits, box, 0.5 * left + 20.0 * run.limits.turn_radius_m)
-    surface, _ = problem.surface_for(1.5 * left + 1.0)
+    goal = (float(rest[-1, 0]), float(rest[-1, 1]))
+    limits = from_true_north(problem.limits, problem.grid, None, goal)
+    surface, _ = replace(problem, limits=limits).surface_for(1.5 * left + 1.0)
     clock = time.perf_counter()
     found, trouble = replan(surface, state, rest, problem.grid.crs)
     more = {

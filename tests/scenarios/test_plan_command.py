@@ -377,3 +377,19 @@ def test_a_map_without_sigma_is_told_to_hold_as_it_stands(chart, tmp_path, caplo
     caplog.clear()
     assert plan(chart, tmp_path, "--map-sigma", 0.2, "--risk", 0.1).exception is None
     assert "has no sigma" not in caplog.text
+
+
+def test_an_observability_map_makes_ground_dear_by_its_mean_error(tmp_path):
+    frame = grid_of(flat())
+    write_map(tmp_path / "map.tif", frame)
+    bands = {"sigma_best": np.zeros((120, 120)), "sigma_mean": np.full((120, 120), 2.0)}
+    write_bands(tmp_path / "observability.tif", bands, frame)
+    (tmp_path / "c.toml").write_text("[cost]\nposition_per_m = 0.5\n")
+    result = run(
+        "--map", tmp_path / "map.tif", "--start", position(10, 60), "--goal", position(110, 60),
+        "--out", tmp_path / "o", "--region-weights", "none", "--planner", "none", "--no-picture",
+        "--position-sigma", tmp_path / "observability.tif", "--cost", tmp_path / "c.toml",
+    )  # fmt: skip
+    assert result.exception is None, result.exception
+    metrics = json.loads((tmp_path / "o" / "metrics.json").read_text())
+    np.testing.assert_allclose(metrics["cost"], 100.0 * (1.0 + 0.5 * 2.0), rtol=1e-3)
