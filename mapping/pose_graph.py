@@ -8,7 +8,7 @@ docs/pose-graph.md has the derivation.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -158,21 +158,12 @@ def solve(
         before,
         after,
     )
-    passes = len(keyframes.starts) - 1
-
-    def covariance(key: int, size: int) -> FloatArray:
-        if marginals is None:
-            return np.full((size, size), np.nan)
-        return np.asarray(marginals.marginalCovariance(key))
-
-    strip_cov = [covariance(B(p), 3) for p in range(passes)]
-    return Solution(
-        correction_m=np.array([result.atVector(E(k)) for k in range(len(keyframes))]),
-        covariance_m2=np.array([covariance(E(k), 2) for k in range(len(keyframes))]),
-        pass_errors=np.array([result.atVector(B(p)) for p in range(passes)]),
-        pass_sigma=np.sqrt(np.array([np.diag(c) for c in strip_cov])),
-        height_m=np.array([result.atVector(H(p))[0] for p in range(passes)]),
-        height_sigma_m=np.sqrt(np.array([covariance(H(p), 1)[0, 0] for p in range(passes)])),
+    cov = None if marginals is None else marginals.marginalCovariance
+    return solution_of(
+        keyframes,
+        result.atVector,
+        cov,
+        config,
         link_used=used[:n_links],
         fix_used=used[n_links + len(steps) :],
         step_used=used[n_links : n_links + len(steps)],
@@ -180,7 +171,47 @@ def solve(
         error_before=before,
         error_after=after,
         indeterminate=indeterminate,
-        worsened=bool(after > before * (1 + 1e-9) + 1e-9),
+    )
+
+
+def solution_of(
+    keyframes: Keyframes,
+    vector_at: Callable[[int], FloatArray],
+    covariance_of: Callable[[int], FloatArray] | None,
+    config: GraphConfig,
+    *,
+    link_used: BoolArray,
+    fix_used: BoolArray,
+    step_used: BoolArray,
+    error_before: float,
+    error_after: float,
+    log_evidence: float = float("nan"),
+    indeterminate: bool = False,
+) -> Solution:
+    """Collect a solution from a solver's estimate and marginal covariance of each key (None: unknown)."""
+    passes = range(len(keyframes.starts) - 1)
+
+    def covariance(key: int, size: int) -> FloatArray:
+        if covariance_of is None:
+            return np.full((size, size), np.nan)
+        return np.asarray(covariance_of(key))
+
+    strip_cov = [covariance(B(p), 3) for p in passes]
+    return Solution(
+        correction_m=np.array([vector_at(E(k)) for k in range(len(keyframes))]),
+        covariance_m2=np.array([covariance(E(k), 2) for k in range(len(keyframes))]),
+        pass_errors=np.array([vector_at(B(p)) for p in passes]),
+        pass_sigma=np.sqrt(np.array([np.diag(c) for c in strip_cov])),
+        height_m=np.array([vector_at(H(p))[0] for p in passes]),
+        height_sigma_m=np.sqrt(np.array([covariance(H(p), 1)[0, 0] for p in passes])),
+        link_used=link_used,
+        fix_used=fix_used,
+        step_used=step_used,
+        log_evidence=log_evidence,
+        error_before=error_before,
+        error_after=error_after,
+        indeterminate=indeterminate,
+        worsened=bool(error_after > error_before * (1 + 1e-9) + 1e-9),
         config=config,
     )
 
@@ -194,25 +225,37 @@ def build(
 ) -> tuple[Any, Any, list[int]]:
     """Return the graph, its start (no correction) and the indices of factors that may be wrong."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    _add_passes(graph, values, keyframes, config)
-    _add_odometry(graph, values, keyframes, config, absolute=bool(fixes))
+    add_passes(graph, values, keyframes, config)
+    add_odometry(graph, values, keyframes, config, absolute=bool(fixes))
     doubtful: list[int] = []
     for number, link in enumerate(links):
-        doubtful.append(_add_link(graph, values, keyframes, link, number))
+        doubtful.append(add_link(graph, values, keyframes, link, number))
     for step in steps:
         doubtful.append(graph.size())
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, step.sigma_m)
-        height = np.array([step.height_m])
-        graph.add(gtsam.BetweenFactorVector(H(step.first), H(step.second), height, noise))
+        add_step(graph, step)
     for fix in fixes:
         doubtful.append(graph.size())
-        noise = gtsam.noiseModel.Gaussian.Covariance(fix.covariance_m2)
-        graph.add(gtsam.PriorFactorVector(E(fix.keyframe), fix.correction_m, noise))
+        add_fix(graph, fix)
     return graph, values, doubtful
 
 
-def _add_passes(graph: Any, values: Any, keyframes: Keyframes, config: GraphConfig) -> None:
-    """Add each pass's scale, course bias, sonar heading bias and height offset with their priors."""
+def add_step(graph: Any, step: HeightStep) -> None:
+    """Add a height step between two strips."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, step.sigma_m)
+    height = np.array([step.height_m])
+    graph.add(gtsam.BetweenFactorVector(H(step.first), H(step.second), height, noise))
+
+
+def add_fix(graph: Any, fix: KeyframeFix) -> None:
+    """Add an absolute fix of a keyframe."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(fix.covariance_m2)
+    graph.add(gtsam.PriorFactorVector(E(fix.keyframe), fix.correction_m, noise))
+
+
+def add_passes(
+    graph: Any, values: Any, keyframes: Keyframes, config: GraphConfig, first: int = 0
+) -> None:
+    """Add scale, course bias, sonar heading bias and height offset of each pass from `first` on."""
     bias, sonar = np.radians(config.heading_bias_deg), np.radians(config.sonar_heading_deg)
     covariance = np.diag([config.scale**2, bias**2, bias**2 + sonar**2])
     # One compass steers the dead reckoning and points the sonar: their errors are mostly one.
@@ -224,7 +267,7 @@ def _add_passes(graph: Any, values: Any, keyframes: Keyframes, config: GraphConf
     unit = gtsam.noiseModel.Unit.Create(3)
     height = gtsam.noiseModel.Isotropic.Sigma(1, config.height_m)
     same_dive = _same_dive(keyframes)
-    for p in range(len(keyframes.starts) - 1):
+    for p in range(first, len(keyframes.starts) - 1):
         values.insert(B(p), np.zeros(3))
         values.insert(H(p), np.zeros(1))
         if kept and same_dive[p]:
@@ -239,17 +282,22 @@ def _same_dive(keyframes: Keyframes) -> BoolArray:
     return np.isfinite(keyframes.way_m[keyframes.starts[:-1]])
 
 
-def _add_odometry(
-    graph: Any, values: Any, keyframes: Keyframes, config: GraphConfig, absolute: bool
+def add_odometry(
+    graph: Any,
+    values: Any,
+    keyframes: Keyframes,
+    config: GraphConfig,
+    absolute: bool,
+    first: int = 0,
 ) -> None:
-    """Add corrections and the way between them: a random walk plus the pass's scale and course error.
+    """Add corrections from keyframe `first` on and the way between: a random walk, scale and course error.
 
     e[k] - e[k-1] = scale * d + bias * perpendicular(d) + walk, with d the navigation's step.
     """
     position = np.column_stack([keyframes.easting_m, keyframes.northing_m])
     start_m = config.start_with_fixes_m if absolute else config.start_m
     start = gtsam.noiseModel.Isotropic.Sigma(2, start_m)
-    for k in range(len(keyframes)):
+    for k in range(first, len(keyframes)):
         values.insert(E(k), np.zeros(2))
         way = keyframes.way_m[k]
         if not np.isfinite(way):
@@ -269,7 +317,7 @@ def _add_odometry(
         )
 
 
-def _add_link(graph: Any, values: Any, keyframes: Keyframes, link: Link, number: int) -> int:
+def add_link(graph: Any, values: Any, keyframes: Keyframes, link: Link, number: int) -> int:
     """Add the two patches of ground and the registration between them; return its factor's index."""
     tie = gtsam.noiseModel.Isotropic.Sigma(2, _TIE_M)
     ends = ((link.first, link.first_offset_m), (link.second, link.second_offset_m))
