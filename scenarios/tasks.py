@@ -22,6 +22,11 @@ TASKS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "mission_task",
         ("scenarios.pipeline", "scipy.sparse", "numba"),
     ),
+    "terrain": (
+        "scenarios.terrain_matching",
+        "terrain_task",
+        ("scenarios.terrain_matching", "numba", "filterpy.kalman"),
+    ),
     "arithmetic": ("scenarios.tasks", "arithmetic_task", ("numpy.random",)),
 }
 
@@ -38,6 +43,11 @@ def find_task(name: str) -> Task:
 def check_config(task: str, config: dict[str, Any], path: Path) -> None:
     """Refuse a run's config before anything runs; tasks without a schema take what they get."""
     if task == "arithmetic":
+        return
+    if task == "terrain":
+        from scenarios.terrain_matching import experiment_of
+
+        experiment_of(config, str(path))
         return
     from scenarios.schema import scenario_of
 

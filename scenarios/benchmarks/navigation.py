@@ -20,10 +20,10 @@ from localization.particles import ParticleFilter
 from localization.terrain import TerrainMap, terrain_map
 from perception.records import FloatArray, Progress
 from scenarios.benchmarks import Row, Table
+from scenarios.benchmarks.navigation_bound import causal_bound
 from scenarios.benchmarks.navigation_sets import (
     NavigationSet,
     SetConfig,
-    body_to_grid,
     degraded,
     make_set,
     prior_map,
@@ -161,49 +161,10 @@ def _harmed(drawn: NavigationSet, case: Case, rng: np.random.Generator) -> Navig
 
 
 def cramer_rao(config: SetConfig, drawn: NavigationSet, rng: np.random.Generator) -> float:
-    """Bound on the rms error of a causal estimate over the second half, m.
-
-    Information on (east, north, heading error, scale, depth bias) adds up along the true track, from
-    true slopes and white noise; offsets of the moment follow from the states at the start.
-    """
+    """Bound on the rms error of a causal estimate over the second half, m."""
     floor = spectral_floor(config, rng.spawn(4)[0])
-    east, north = drawn.truth_easting_m, drawn.truth_northing_m
-    nav = drawn.nav
-    azimuth = np.radians([45.0, 135.0, 225.0, 315.0])
-    sine, cosine = np.sin(np.radians(30.0)), np.cos(np.radians(30.0))
-    body = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.full(4, cosine)], axis=1)
-    heading = np.radians(nav["heading_deg"])
-    level = np.zeros(len(heading))
-    rays = np.einsum("nij,bj->nbi", body_to_grid(heading, level, level), body)
-    information = np.diag(
-        1.0
-        / np.array(
-            [config.start_m, config.start_m, np.radians(config.heading_deg), config.scale,
-             config.depth_bias_m]
-        ) ** 2
-    )  # fmt: skip
-    far_e, far_n = east - east[0], north - north[0]
-    slant = np.stack([nav[f"beam{b + 1}_m"] for b in range(4)], axis=1)
-    usual = float(np.nanmedian(slant))
-    # Wild beams tell nothing.
-    good = np.abs(slant - usual) < 0.8 * usual
-    at_e, at_n = east[:, None] + slant * rays[..., 0], north[:, None] + slant * rays[..., 1]
-    slope_e = -(floor.depth_m(at_e + 2.5, at_n) - floor.depth_m(at_e - 2.5, at_n)) / 5.0
-    slope_n = -(floor.depth_m(at_e, at_n + 2.5) - floor.depth_m(at_e, at_n - 2.5)) / 5.0
-    noise = (config.beam_noise * slant * cosine) ** 2 + config.map_error_m**2
-    total = []
-    for i in range(len(east)):
-        e, n = slope_e[i], slope_n[i]
-        turn = e * far_n[i] - n * far_e[i]
-        j = np.stack([e, n, turn, e * far_e[i] + n * far_n[i], np.ones(4)], axis=1)
-        weight = np.where(good[i], 1.0 / noise[i], 0.0)
-        information = information + (j * weight[:, None]).T @ j
-        if i >= len(east) // 2:
-            now = np.array(
-                [[1.0, 0, far_n[i], far_e[i], 0], [0, 1.0, -far_e[i], far_n[i], 0]]
-            )  # fmt: skip
-            total.append(np.trace(now @ np.linalg.inv(information) @ now.T))
-    return float(np.sqrt(np.mean(total)))
+    bound = causal_bound(floor, config, drawn)
+    return float(np.sqrt(np.mean(bound[len(bound) // 2 :] ** 2)))
 
 
 def _timing_rows() -> list[Row]:

@@ -14,9 +14,15 @@ from scipy import ndimage
 
 from perception.records import FloatArray, Grid
 
-# The vehicle and the sonar of the goals: four beams, 30 degrees off nadir, a ping every 3 s.
-_AZIMUTH_RAD = np.radians([45.0, 135.0, 225.0, 315.0])
-_OFF_NADIR_RAD = np.radians(30.0)
+# Beams of the sensor sets, degrees: azimuth clockwise from the bow, and off nadir. The goals' sonar is
+# `dvl`.
+BEAMS_DEG: dict[str, tuple[tuple[float, float], ...]] = {
+    "dvl": tuple((azimuth, 30.0) for azimuth in (45.0, 135.0, 225.0, 315.0)),
+    "altimeter": ((0.0, 0.0),),
+    "fan": tuple(
+        (90.0 if side > 0 else 270.0, abs(side)) for side in (-60, -40, -20, 0, 20, 40, 60)
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +52,12 @@ class SetConfig:
     drift_m_sqrt_s: float = 0.0
     outliers: float = 0.0
     attitude_deg: float = 2.0
+    sensors: str = "dvl"
+
+    @property
+    def beams_rad(self) -> FloatArray:
+        """Azimuth and angle off nadir (beams, 2)."""
+        return np.radians(np.array(BEAMS_DEG[self.sensors]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +175,14 @@ def cast(
     return (low + high) / 2
 
 
+def body_rays(config: SetConfig) -> FloatArray:
+    """Unit vectors (beams, 3) forward, starboard, down."""
+    azimuth, off = config.beams_rad.T
+    return np.stack(
+        [np.sin(off) * np.cos(azimuth), np.sin(off) * np.sin(azimuth), np.cos(off)], axis=1
+    )
+
+
 def body_to_grid(
     heading_rad: FloatArray, pitch_rad: FloatArray, roll_rad: FloatArray
 ) -> FloatArray:
@@ -193,22 +213,17 @@ def make_set(
     heading = np.concatenate([heading[:1], heading])
     tilt = np.radians(config.attitude_deg) * track_rng.standard_normal((2, n))
     depth = np.full(n, 100.0 - config.altitude_m)
-    ray_body = np.array(
-        [
-            [np.sin(_OFF_NADIR_RAD) * np.cos(a), np.sin(_OFF_NADIR_RAD) * np.sin(a),
-             np.cos(_OFF_NADIR_RAD)]
-            for a in _AZIMUTH_RAD
-        ]
-    )  # fmt: skip
+    ray_body = body_rays(config)
     rays = np.einsum("nij,bj->nbi", body_to_grid(heading, tilt[0], tilt[1]), ray_body)
     nav = _navigation(config, track_rng, time_s, easting, northing, heading, step_e, step_n)
     nav["depth_m"] = depth + config.depth_bias_m * track_rng.standard_normal()
     nav["pitch_deg"], nav["roll_deg"] = np.degrees(tilt)
-    for b in range(4):
+    for b in range(len(ray_body)):
         beam = cast(floor, easting, northing, depth, rays[:, b])
         beam *= 1 + config.beam_noise * beam_rng.standard_normal(n)
         wild = beam_rng.random(n) < config.outliers
-        nav[f"beam{b + 1}_m"] = np.where(wild, beam_rng.uniform(5.0, 150.0, n), beam)
+        name = "altitude_m" if config.sensors == "altimeter" else f"beam{b + 1}_m"
+        nav[name] = np.where(wild, beam_rng.uniform(5.0, 150.0, n), beam)
     return NavigationSet(prior, nav, easting, northing)
 
 

@@ -84,6 +84,10 @@ def _summarise(plan: SweepPlan, out: Path) -> list[tuple[str, str]]:
     causes = results.failures_by_cause(table)
     rows += [(f"{count} x", cause) for cause, count in causes.items()]
     plot_experiment(out, table, set(plan.sweep.keys), causes)
+    if plan.sweep.task == "terrain":
+        from scenarios.plots_terrain import plot_terrain
+
+        plot_terrain(out, table, set(plan.sweep.keys))
     config = {**plan.scenario, "sweep": plan.sweep.model_dump(mode="json", exclude_none=True)}
     write_metrics(out, metrics, config, plan.sweep.seed)
     return rows
