@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from perception.records import InputError
-from planning.currents import STRONGEST
-from planning.surface import DRIFT_X, Surface
+from planning.bars import bar_of
+from planning.surface import Surface
 
 
 def end_node(surface: Surface, end: tuple[float, float], name: str) -> tuple[int, int]:
@@ -42,25 +42,15 @@ def end_node(surface: Surface, end: tuple[float, float], name: str) -> tuple[int
 def _why_barred(surface: Surface, row: int, col: int) -> str:
     bottom, lower = surface.bottom_m[row, col], surface.lower_m[row, col]
     limits = surface.limits
-    if not np.isfinite(bottom):
-        return "lies on or beside a cell without data; move it to mapped ground"
-    if not np.isfinite(lower):
-        return "lies where the map has a height but no sigma; move it or give --map-sigma"
-    if lower > surface.top_m:
-        return (
-            f"lies in rock or too shallow: the bottom at {bottom:.2f} m needs the vehicle at "
-            f"{lower:.2f} m, above the water's surface; move it to deeper water"
-        )
-    if bottom + limits.ceiling_m < -limits.depth_max_m:
-        return (
-            f"is too deep: {limits.ceiling_m:g} m above the bottom at {bottom:.2f} m is still below "
-            f"depth_max_m {limits.depth_max_m:g}; raise depth_max_m or ceiling_m"
-        )
-    if bottom + limits.ceiling_m < lower:
-        return (
-            f"lies where floor and k sigma need {lower - bottom:.2f} m of altitude, above the "
-            f"ceiling of {limits.ceiling_m:g} m; raise ceiling_m or --risk"
-        )
-    if surface.drifts and np.hypot(*surface.stack[row, col, DRIFT_X:]) > STRONGEST:
-        return "lies where the current is as strong as the vehicle; raise speed_m_s or move it"
-    return "lies in a no-go area; move it out"
+    return {
+        "no data": "lies on or beside a cell without data; move it to mapped ground",
+        "no sigma": "lies where the map has a height but no sigma; move it or give --map-sigma",
+        "shallow": f"lies in rock or too shallow: the bottom at {bottom:.2f} m needs the vehicle at "
+        f"{lower:.2f} m, above the water's surface; move it to deeper water",
+        "deep": f"is too deep: {limits.ceiling_m:g} m above the bottom at {bottom:.2f} m is still below "
+        f"depth_max_m {limits.depth_max_m:g}; raise depth_max_m or ceiling_m",
+        "ceiling": f"lies where floor and k sigma need {lower - bottom:.2f} m of altitude, above the "
+        f"ceiling of {limits.ceiling_m:g} m; raise ceiling_m or --risk",
+        "current": "lies where the current is as strong as the vehicle; raise speed_m_s or move it",
+        "no-go": "lies in a no-go area; move it out",
+    }[bar_of(surface, row, col)]

@@ -12,17 +12,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from perception.records import BoolArray, FloatArray, IntArray
-from planning.currents import STRONGEST
+from planning.bars import bar_of
 from planning.curve import waypoints
 from planning.field import search
 from planning.polish import RADIUS_RESERVE, Candidate, evaluate, polish, respace, rules_of
 from planning.profile import cone_envelope, make_work, path_cost
-from planning.surface import BAR, BOTTOM, DRIFT_X, LOWER, WEIGHT, Surface
+from planning.surface import BAR, BOTTOM, LOWER, WEIGHT, Surface
 
 # Price of a metre through barred ground: a detour of a hundred times a wall's thickness is taken first.
 _WALL_PRICE = 100.0
 # What the proof may add to a planned height (m) when a relaxation is named.
 _HAIR_M = 0.3
+# What planning keeps in reserve between two limits that meet (m).
+_ROOM_M = 0.1
 # A breach (m^2) that touches a barred corner between samples, and is none.
 _TINY = 1e-3
 # So far above the ceiling that it limits nothing (m).
@@ -67,14 +69,13 @@ def explain_barrier(surface: Surface, source: tuple[int, int], target: tuple[int
     last = first
     while last + 1 < len(nodes) and blocked[last + 1]:
         last += 1
-    middle = nodes[(first + last) // 2]
     x, y = nodes[:, 1] * surface.cell_m[0], nodes[:, 0] * surface.cell_m[1]
     easting, northing = surface.world(x, y)
     place = (float(easting[(first + last) // 2]), float(northing[(first + last) // 2]))
     thick = float(np.hypot(*(nodes[last] - nodes[first]) * np.array(surface.cell_m[::-1])))
     reason = (
         f"barred ground parts start and goal; the thinnest way through is {thick + min(surface.cell_m):.0f} m "
-        f"at {place[0]:.1f},{place[1]:.1f}, {_what_bars(surface, int(middle[0]), int(middle[1]))}"
+        f"at {place[0]:.1f},{place[1]:.1f}, {_what_bars(surface, nodes[first : last + 1])}"
     )
     return Blockage(
         reason, "barred", place, np.column_stack([easting, northing]),
@@ -93,31 +94,50 @@ def _beside(surface: Surface, nodes: IntArray) -> BoolArray:
     return out
 
 
-def _what_bars(surface: Surface, row: int, col: int) -> str:
+def _what_bars(surface: Surface, wall: IntArray) -> str:
+    """Say what bars the middle node of a wall, and what would open all (n, 2) nodes of it."""
     limits = surface.limits
+    row, col = (int(v) for v in wall[len(wall) // 2])
+    bottoms, lowers = (
+        surface.bottom_m[wall[:, 0], wall[:, 1]],
+        surface.lower_m[wall[:, 0], wall[:, 1]],
+    )
     bottom, lower = surface.bottom_m[row, col], surface.lower_m[row, col]
-    if not np.isfinite(bottom):
-        return "where the map has no data: survey or fill it"
-    if not np.isfinite(lower):
-        return "where the map has no sigma: give --map-sigma"
-    if lower > surface.top_m:
+    bar = bar_of(surface, row, col)
+    if bar == "shallow":
         room = surface.top_m - bottom
         if room <= 0:
             return f"where the ground stands {-room:.1f} m above the water: nothing opens it"
+        floor = limits.floor_m - (float(np.nanmax(lowers)) - surface.top_m) - _ROOM_M
+        way = "nothing opens it" if floor < 0 else f"a floor_m of {_below(floor):g} opens it"
         return (
             f"where only {room:.1f} m of water stand over the ground and floor and k sigma need "
-            f"{lower - bottom:.1f} m: a floor_m of {max(0.0, limits.floor_m - (lower - surface.top_m)):.2f} opens it"
+            f"{lower - bottom:.1f} m: {way}"
         )
-    if bottom + limits.ceiling_m < -limits.depth_max_m:
-        return f"deeper than depth_max_m: {-bottom - limits.ceiling_m:.1f} m opens it"
-    if bottom + limits.ceiling_m < lower:
+    if bar == "deep":
+        need = -float(np.nanmin(bottoms)) - limits.ceiling_m + _ROOM_M
+        return f"deeper than depth_max_m: a depth_max_m of {_above(need):g} opens it"
+    if bar == "ceiling":
+        need = float(np.nanmax(lowers - bottoms)) + _ROOM_M
         return (
-            f"where floor and k sigma need {lower - bottom:.1f} m of altitude: a ceiling_m of "
-            f"{lower - bottom:.1f} or a higher --risk opens it"
+            f"where floor and k sigma need {need:.1f} m of altitude: a ceiling_m of {_above(need):g} "
+            "or a higher --risk opens it"
         )
-    if surface.drifts and np.hypot(*surface.stack[row, col, DRIFT_X:]) > STRONGEST:
-        return "where the current is as strong as the vehicle: a higher speed_m_s opens it"
-    return "in a no-go area: leave it out or move an end"
+    return {
+        "no data": "where the map has no data: survey or fill it",
+        "no sigma": "where the map has no sigma: give --map-sigma",
+        "current": "where the current is as strong as the vehicle: a higher speed_m_s opens it",
+        "no-go": "in a no-go area: leave it out or move an end",
+    }[bar]
+
+
+def _above(value: float) -> float:
+    """Round up to a tenth: a limit named as the way out must be one."""
+    return math.ceil(value * 10.0 - 1e-9) / 10.0
+
+
+def _below(value: float) -> float:
+    return math.floor(value * 10.0 + 1e-9) / 10.0
 
 
 def explain_limits(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -199,6 +200,24 @@ def test_the_thinnest_place_of_a_planted_wall_is_named_within_a_cell(seed, kind)
     found_row, found_col = grid.fractional_index(*(np.array(v) for v in plan.blockage.place))
     assert abs(found_col - place) <= 1
     assert first[place] - 1 <= found_row <= first[place] + 3
+
+
+@pytest.mark.parametrize(
+    ("wall_m", "key", "more"),
+    [(-3.2, "floor_m", {}), (-130.0, "depth_max_m", {"depth_max_m": 90.0})],
+)
+def test_the_limit_that_a_wall_of_water_names_opens_it(wall_m, key, more):
+    # Slopes gentle enough for pitch, a wall too shallow to pass or too deep to go.
+    row = np.arange(240.0)
+    z = np.tile((-40.0 + (wall_m + 40.0) * np.exp(-(((row - 120) / 45) ** 2)))[:, None], (1, 60))
+    z = np.round(z, 2)
+    grid = grid_of(z)
+    start, goal = at(grid, 5, 30), at(grid, 235, 30)
+    plan = plan_route(grid, start, goal, VehicleLimits(**more), config=QUICK)
+    assert plan.route is None
+    value = float(re.search(rf"a {key} of ([0-9.]+) opens it", plan.reason)[1])
+    eased = VehicleLimits(**{**more, key: value})
+    assert_within_limits(grid, plan_route(grid, start, goal, eased, config=QUICK), eased)
 
 
 def test_a_wall_too_steep_for_pitch_and_ceiling_is_named_with_a_way_out():
