@@ -155,10 +155,9 @@ def _measure(shadow: Shadow, fitted: bool, seen: _Side) -> ObjectRow | None:
         if fit is not None and fit.gain < config.min_gain:
             return None
     if fit is not None and _explains(fit, shadow, edges, seen.track):
-        row = _of_fit(fit, edges, len(shadow.core), dark, seen)
-    else:
-        row = _of_shadow(shadow, order > 0, edges, dark, seen)
-    return row
+        return _of_fit(fit, edges, len(shadow.core), dark, seen)
+    # Beyond the swath's edge no highlight could be seen: a shadow that leaves it counts as a hill's.
+    return _of_shadow(shadow, shadow.open or order > 0, edges, dark, _fitted_half_m(fit), seen)
 
 
 def _edges(shadow: Shadow, seen: _Side) -> _Edges:
@@ -197,6 +196,8 @@ def _explains(fit: BumpFit, shadow: Shadow, edges: _Edges, track: Track) -> bool
         and sx < 8 * sy
         and fit.height_m < (0.98 if fit.sign > 0 else 3.0) * edges.drop_m
         and sigma_log < 0.5
+        # A summit lies at or above its grazing point; labels reach onto slopes that are merely turned away.
+        and fit.height_m > 0.5 * edges.proved_m(fit.sign > 0)
     )
 
 
@@ -235,8 +236,18 @@ def _relief(half_size_m: float, seen: _Side) -> float:
     return float(np.sqrt(0.5 * seen.roughness.variogram(np.array(half_size_m))))
 
 
-def _of_shadow(shadow: Shadow, hill: bool, edges: _Edges, dark: float, seen: _Side) -> ObjectRow:
-    """Measure by the paper's relation: order of levels for the kind, the longest shadow for the height."""
+def _fitted_half_m(fit: BumpFit | None) -> float:
+    """Return the larger half size of a fit that does not explain its shadow: the lie of the land, often."""
+    return 0.0 if fit is None else float(np.exp(fit.parameters[3:5]).max())
+
+
+def _of_shadow(
+    shadow: Shadow, hill: bool, edges: _Edges, dark: float, land_m: float, seen: _Side
+) -> ObjectRow:
+    """Measure by the paper's relation: order of levels for the kind, the longest shadow for the height.
+
+    `land_m` is the half size of what the fit took the shadow for; relief of that size may have cast it.
+    """
     height = edges.proved_m(hill)
     spread = hill_sigma if hill else crater_sigma
     sigma = float(
@@ -258,7 +269,7 @@ def _of_shadow(shadow: Shadow, hill: bool, edges: _Edges, dark: float, seen: _Si
         sigma_m=sigma, slant_range_m=edges.start_m, shadow_length_m=edges.length_m,
         pass_index=0, ping=0, across_m=x_start if hill else 0.5 * (x_start + x_end),
         along_m=middle, half_across_m=half_across, half_along_m=half, lower_bound=shadow.open,
-        probability=object_probability(height, max(half, half_across), dark, seen.roughness),
+        probability=object_probability(height, max(half, half_across, land_m), dark, seen.roughness),
     )  # fmt: skip
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from scipy import ndimage
 
 from perception.levels import SHADOW
@@ -26,9 +27,10 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """One connected shadow: its box in the image, and start and end sample per ping (-1 none).
+    """One connected shadow: its box in the image, and start and end sample per ping.
 
-    `open` where most of its long pings are dark to their last sample: the shadow goes on unseen.
+    `start` and `end` are those of the ping's longest dark stretch. `open`: dark to the pings' last sample,
+    so the shadow goes on unseen; such pings make a shadow of their own.
     """
 
     number: int
@@ -43,7 +45,7 @@ class Shadow:
 
     @property
     def lengths(self) -> IntArray:
-        return np.where(self.start >= 0, self.end - self.start, 0)
+        return self.end - self.start
 
     @property
     def core(self) -> IntArray:
@@ -55,7 +57,7 @@ class Shadow:
         lengths = self.lengths.astype(float)
         if len(lengths) >= 3:
             lengths = np.convolve(lengths, [0.25, 0.5, 0.25], mode="same")
-        return int(np.argmax(np.where(self.start >= 0, lengths, -1)))
+        return int(np.argmax(lengths))
 
     def along_extent(self, track: Track) -> tuple[float, float]:
         """Return the middle along the track and the half width, by moments of the lengths (metres).
@@ -73,6 +75,8 @@ class Shadow:
 
 # A shadow that ends this near to its ping's last sample is cut off there.
 _EDGE_SAMPLES = 3
+# Gaps in a dark stretch below this part of the range do not end it.
+_BRIDGE = 0.015
 
 
 def find_shadows(
@@ -85,33 +89,84 @@ def find_shadows(
     label : (n, m) levels; ratio : (n, m) equalised power, NaN past a ping's last sample.
     min_samples, min_pings, min_cells : least samples in range of the longest pings, pings, cells.
     """
-    marks, count = ndimage.label(label == SHADOW, structure=np.ones((3, 3)))
-    sizes = np.bincount(marks.ravel(), minlength=count + 1)
+    dark = label == SHADOW
     known = np.isfinite(ratio)
     last = np.where(known.any(axis=1), ratio.shape[1] - known[:, ::-1].argmax(axis=1), 0)
+    tail = _tails(dark, last)
+    tail[last - tail < min_samples] = ratio.shape[1]
+    columns = np.arange(ratio.shape[1])
+    cut = (columns >= tail[:, None]) & (columns < last[:, None])
     shadows = []
-    for number, box in enumerate(ndimage.find_objects(marks), start=1):
-        rows, columns = box
-        if (
-            sizes[number] < min_cells
-            or rows.stop - rows.start < min_pings
-            or columns.stop - columns.start < min_samples
-        ):
-            continue
-        own = marks[box] == number
-        any_row = own.any(axis=1)
-        start = np.where(any_row, own.argmax(axis=1) + columns.start, -1)
-        end = np.where(any_row, columns.stop - own[:, ::-1].argmax(axis=1), -1)
-        lengths = np.where(any_row, end - start, 0)
-        if np.sort(lengths)[-2:].min() < min_samples - 1:
-            continue
-        core = lengths >= 0.5 * lengths.max()
-        cut = np.mean(end[core] > last[rows][core] - _EDGE_SAMPLES)
-        shadows.append(
-            Shadow(number, rows.start, rows.stop, columns.start, columns.stop,
-                   start, end, int(sizes[number]), bool(cut > 0.5))
-        )  # fmt: skip
+    total = 0
+    marks = np.zeros(dark.shape, np.int32)
+    for part, is_open in ((cut, True), (dark & ~cut, False)):
+        found, count = ndimage.label(part, structure=np.ones((3, 3)))
+        sizes = np.bincount(found.ravel(), minlength=count + 1)
+        for number, box in enumerate(ndimage.find_objects(found), start=1):
+            if sizes[number] < min_cells:
+                continue
+            shadow = _shadow(found, number, box, int(sizes[number]), is_open)
+            shadow = replace(shadow, number=number + total)
+            if (
+                shadow.row1 - shadow.row0 >= min_pings
+                and np.sort(shadow.lengths)[-2:].min() >= min_samples - 1
+            ):
+                shadows.append(shadow)
+        marks += np.where(found > 0, found + total, 0).astype(np.int32)
+        total += count
     return marks, shadows
+
+
+def _shadow(
+    marks: IntArray, number: int, box: tuple[slice, slice], cells: int, is_open: bool
+) -> Shadow:
+    """Return one mark's shadow, its thread-like first and last pings left off."""
+    rows, columns = box
+    own = marks[box] == number
+    start, end = own.argmax(axis=1), own.shape[1] - own[:, ::-1].argmax(axis=1)
+    if not is_open:
+        start, end = _longest_runs(own, columns.start)
+    lengths = end - start
+    thick = np.flatnonzero(lengths > 0.1 * lengths.max())
+    low, high = int(thick[0]), int(thick[-1]) + 1
+    seen = own[low:high].any(axis=0).nonzero()[0] + columns.start
+    return Shadow(number, rows.start + low, rows.start + high, int(seen[0]), int(seen[-1]) + 1,
+                  start[low:high] + columns.start, end[low:high] + columns.start, cells, is_open)  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _tails(dark, last):  # type: ignore[no-untyped-def]
+    """Return where the dark stretch begins (n,) that runs to each ping's last sample; the width where none does."""
+    n, m = dark.shape
+    begin = np.full(n, m, np.int64)
+    for i in range(n):
+        at = last[i]
+        for k in range(last[i] - 1, -1, -1):
+            if dark[i, k]:
+                at = k
+            elif at - k > max(_EDGE_SAMPLES, _BRIDGE * at):
+                break
+        if at < last[i]:
+            begin[i] = at
+    return begin
+
+
+@njit(cache=True, nogil=True)
+def _longest_runs(own, first):  # type: ignore[no-untyped-def]
+    """Return start and end (n,) of each row's longest run of True, small gaps closed."""
+    n, m = own.shape
+    start, end = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    for i in range(n):
+        begin, after = -1, -1
+        for k in range(m):
+            if not own[i, k]:
+                continue
+            if begin < 0 or k > after + 1 + _BRIDGE * (first + k):
+                begin = k
+            after = k + 1
+            if after - begin > end[i] - start[i]:
+                start[i], end[i] = begin, after
+    return start, end
 
 
 def order_evidence(shadow: Shadow, ratio: FloatArray, looks: float) -> float:
