@@ -23,7 +23,7 @@ from perception.objects import ObjectTable
 from perception.readers import Survey
 from perception.records import ElevationStrip, FloatArray, InputError, Progress, silent
 from perception.strip_files import read_strip, write_strip
-from perception.strips import StripConfig, build_strip
+from perception.strips import PassResult, StripConfig, build_strip
 
 logger = logging.getLogger(__name__)
 
@@ -75,22 +75,25 @@ def file_passes(
         progress("echoes to strips", index, survey.n_passes)
         key = hashlib.blake2b(repr((identity, config, index)).encode(), digest_size=16).hexdigest()
         path = folder / f"strip-{index:03d}.nc"
-        try:
-            filed_passes.append(_taken_up(path, key) or _made(survey, index, path, key, config))
-        except InputError as error:
-            refused.append(str(error))
-            logger.warning("%s; left out", error)
+        kept = _taken_up(path, key)
+        if kept is None:
+            try:
+                result = build_strip(survey.swath(index), config)
+            except InputError as error:
+                refused.append(str(error))
+                logger.warning("%s; left out", error)
+                continue
+            kept = _written(result, path, key, survey.utc)
+        filed_passes.append(kept)
     progress("echoes to strips", survey.n_passes, survey.n_passes)
     if not filed_passes:
         raise InputError(refused[0] if refused else "the survey holds no pass to make a strip of")
     return filed_passes
 
 
-def _made(
-    survey: Survey, index: int, path: Path, key: str, config: StripConfig | None
-) -> FiledPass:
-    result = build_strip(survey.swath(index), config)
-    write_strip(path, result.strip, survey.utc)
+def _written(result: PassResult, path: Path, key: str, utc: bool) -> FiledPass:
+    """Write a pass; its mark comes last, so that what a killed run left half done is made anew."""
+    write_strip(path, result.strip, utc)
     _write_objects(path.with_suffix(".objects.npz"), result.objects)
     file = StripFile.of(path)
     write_text(path.with_suffix(".json"), json.dumps({"key": key, "digest": file.digest}) + "\n")

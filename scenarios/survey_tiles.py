@@ -118,6 +118,10 @@ def map_tiles(
     folder : where strips and tiles are kept; a later call with the same survey and settings goes on there.
     scheduler : address of a Dask cluster that sees `folder`; None starts a local one of `workers`.
     """
+    if scheduler is not None:
+        # A cluster that does not answer is told before the work, not after it.
+        with open_cluster(scheduler):
+            pass
     passes = file_passes(survey, folder / "strips", identity(survey), progress=progress)
     thin = [one.thin for one in passes]
     config = SurveyConfig(

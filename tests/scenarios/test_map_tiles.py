@@ -136,8 +136,11 @@ def test_tracks_are_lines_of_passes_in_the_survey_s_frame(made: Made) -> None:
             assert columns["sigma_m"][0] > 0
 
 
+@pytest.mark.parametrize(
+    "more", [("--tiles", "--tile-cells", "100"), pytest.param((), marks=pytest.mark.slow)]
+)
 def test_a_full_disk_ends_in_one_line_and_leaves_nothing_half_written(
-    made: Made, tmp_path: Path
+    made: Made, tmp_path: Path, more: tuple[str, ...]
 ) -> None:
     """No file may grow beyond 60 kB, as on a disk that fills up; the file system itself says so."""
     out = tmp_path / "full"
@@ -146,17 +149,16 @@ def test_a_full_disk_ends_in_one_line_and_leaves_nothing_half_written(
         resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
 
     program = "import scenarios.commands as c; c.main()"
-    for more in (("--tiles", "--tile-cells", "100"), ()):
-        run = subprocess.run(
-            [sys.executable, "-c", program, "map", str(made.survey), "--out", str(out), *SETTINGS, *more],
-            capture_output=True, text=True, preexec_fn=small_files, timeout=300, check=False,
-        )  # fmt: skip
-        complaints = [x for x in run.stderr.splitlines() if x.startswith("bathynav: ")]
-        assert run.returncode == 1 and len(complaints) == 1, run.stderr
-        assert "Traceback" not in run.stderr and "cannot be written" in complaints[0]
-        left = [p.name for p in out.rglob("*") if p.is_file()]
-        assert not [name for name in left if name.startswith(".") or ".part" in name], left
-        assert not (out / "map.tif").exists()
+    run = subprocess.run(
+        [sys.executable, "-c", program, "map", str(made.survey), "--out", str(out), *SETTINGS, *more],
+        capture_output=True, text=True, preexec_fn=small_files, timeout=300, check=False,
+    )  # fmt: skip
+    complaints = [x for x in run.stderr.splitlines() if x.startswith("bathynav: ")]
+    assert run.returncode == 1 and len(complaints) == 1, run.stderr
+    assert "Traceback" not in run.stderr and "cannot be written" in complaints[0], run.stderr
+    left = [p.name for p in out.rglob("*") if p.is_file()]
+    assert not [name for name in left if name.startswith(".") or ".part" in name], left
+    assert not (out / "map.tif").exists()
 
 
 @pytest.mark.parametrize(
