@@ -29,8 +29,9 @@ USEFUL_CELLS = 144
 _FEW = 30
 # Cells from one node of the noise map to the next.
 _STEP = 8
-# No map is thinned below this many cells on its longer side.
+# No level is taken unasked that leaves fewer blocks than this on the longer side, and none is thinned below ...
 _LEAST_SIDE = 32
+_LEAST_NODES = 16
 # Above this many cells the level is chosen on tiles of so many cells a side, where most is known.
 _WHOLE_CELLS = 300_000
 _TILE = 256
@@ -71,7 +72,9 @@ def curvature_at(
     thinning = _thinning(grid, least_m)
     if thinning == 1:
         return _curvature(grid, None, least_m, operator)
-    coarse = _curvature(_thinned(grid, thinning), None, 0.0, operator)
+    # A map too small to be thinned further is smoothed instead.
+    rest_m = least_m if least_m >= 2 * thinning * np.sqrt(grid.cell_m * grid.cell_north_m) else 0.0
+    coarse = _curvature(_thinned(grid, thinning), None, rest_m, operator)
     # Bare differences of means have the noise of a Gaussian of half a block, which is smoothing here.
     least_m = 0.5 * thinning * np.sqrt(grid.cell_m * grid.cell_north_m)
     coarse = replace(coarse, scale_m=np.fmax(coarse.scale_m, least_m))
@@ -101,7 +104,7 @@ def _thinning(grid: Grid, least_m: float) -> int:
     """Return the power of two by which a level's map is thinned: its scale is then one to two cells."""
     cell_m = np.sqrt(grid.cell_m * grid.cell_north_m)
     thinning = 1
-    while 2 * thinning * cell_m <= least_m and max(grid.shape) >= 2 * thinning * _LEAST_SIDE:
+    while 2 * thinning * cell_m <= least_m and max(grid.shape) >= 2 * thinning * _LEAST_NODES:
         thinning *= 2
     # One row or column cannot be thinned in one direction alone.
     return thinning if min(grid.shape) >= 4 * thinning else 1
@@ -207,7 +210,9 @@ def _lattice(grid: Grid) -> Iterator[Grid]:
     for i, j in corners:
         window = np.s_[i : i + height, j : j + width]
         sigma_m = None if grid.sigma_m is None else grid.sigma_m[window]
-        yield replace(grid, elevation_m=grid.elevation_m[window], sigma_m=sigma_m, count=None)
+        # A copy: kernels are compiled once, for whole arrays, and not again for windows.
+        z = np.ascontiguousarray(grid.elevation_m[window])
+        yield replace(grid, elevation_m=z, sigma_m=sigma_m, count=None)
 
 
 def typical_cells(sizes: list[npt.NDArray[np.floating[Any]]]) -> float:

@@ -161,7 +161,9 @@ def _timed(work: Callable[[], Any]) -> tuple[float, float]:
 
 def _speed(progress: Progress) -> list[Row]:
     rng = np.random.default_rng(1)
-    segment(Grid(fractal(2048, rng)[:1500, :1500], 0.0, 0.0, 1.0))  # compile in both precisions
+    segment(
+        Grid(np.ascontiguousarray(fractal(2048, rng)[:1500, :1500]), 0.0, 0.0, 1.0)
+    )  # compile in both precisions
     z = fractal(_LARGE, rng)
     case = f"{_LARGE} x {_LARGE} fractal"
     progress("large map", 0, 4)
