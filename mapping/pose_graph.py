@@ -97,8 +97,6 @@ class Solution:
     pass_errors : (p, 3) scale, course bias, sonar heading bias (rad) of each strip; `pass_sigma` alike.
     height_m, height_sigma_m : (p,) to be added to each strip's heights.
     link_used, fix_used, step_used : which were found consistent.
-    log_evidence : logarithm of the probability of what was used under the graph's assumptions, up to a
-        constant of the data; NaN where it cannot be had.
     error_before, error_after : the graph's error (half a chi-square) over what was used.
     indeterminate, worsened : the graph does not determine the answer; the answer is no better.
     config : what was assumed.
@@ -113,7 +111,6 @@ class Solution:
     link_used: BoolArray
     fix_used: BoolArray
     step_used: BoolArray
-    log_evidence: float
     error_before: float
     error_after: float
     indeterminate: bool
@@ -167,11 +164,33 @@ def solve(
         link_used=used[:n_links],
         fix_used=used[n_links + len(steps) :],
         step_used=used[n_links : n_links + len(steps)],
-        log_evidence=_log_evidence(kept, result, after, keyframes, config),
         error_before=before,
         error_after=after,
         indeterminate=indeterminate,
     )
+
+
+def log_evidence(
+    keyframes: Keyframes,
+    links: Sequence[Link],
+    fixes: Sequence[KeyframeFix],
+    config: GraphConfig,
+    steps: Sequence[HeightStep] = (),
+) -> float:
+    """Return the log-probability of the data under `config`, all unknowns integrated out, but for a constant.
+
+    Of the noise models' own determinants only the one that `GraphConfig.shared` changes is counted. NaN
+    where the graph does not determine its unknowns.
+    """
+    graph, values, _ = build(keyframes, links, fixes, config, steps)
+    result = gtsam.GaussNewtonOptimizer(graph, values, gauss_newton()).optimize()
+    try:
+        half_log_det = float(graph.linearize(result).eliminateMultifrontal().logDeterminant())
+    except RuntimeError:
+        return float("nan")
+    chained = int(_same_dive(keyframes).sum()) if config.shared else 0
+    half_of_priors = -1.5 * chained * np.log(1.0 - config.shared**2)
+    return float(half_of_priors - graph.error(result) - half_log_det)
 
 
 def solution_of(
@@ -185,7 +204,6 @@ def solution_of(
     step_used: BoolArray,
     error_before: float,
     error_after: float,
-    log_evidence: float = float("nan"),
     indeterminate: bool = False,
 ) -> Solution:
     """Collect a solution from a solver's estimate and marginal covariance of each key (None: unknown)."""
@@ -207,7 +225,6 @@ def solution_of(
         link_used=link_used,
         fix_used=fix_used,
         step_used=step_used,
-        log_evidence=log_evidence,
         error_before=error_before,
         error_after=error_after,
         indeterminate=indeterminate,
@@ -368,21 +385,6 @@ def gauss_newton() -> Any:
     # Cholesky squares the condition number, and weights of 1 cm stand beside some of 300 m.
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
     return parameters
-
-
-def _log_evidence(
-    graph: Any, result: Any, error: float, keyframes: Keyframes, config: GraphConfig
-) -> float:
-    """Return the log-probability of the data, all unknowns integrated out, up to a constant of the data.
-
-    Of the noise models' own determinants only the one that `shared` changes is counted.
-    """
-    try:
-        half_log_det = float(graph.linearize(result).eliminateMultifrontal().logDeterminant())
-    except RuntimeError:
-        return float("nan")
-    chained = int(_same_dive(keyframes).sum()) if config.shared else 0
-    return float(-error - half_log_det - 1.5 * chained * np.log(1.0 - config.shared**2))
 
 
 def _without(graph: Any, dropped: Sequence[int]) -> Any:

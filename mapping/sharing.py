@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from mapping.keyframes import KeyframeFix, Keyframes
-from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, solve
+from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, log_evidence, solve
 
 logger = logging.getLogger(__name__)
 
@@ -40,8 +40,10 @@ def solve_shared(
     best, most = config.shared, float("-inf")
     for shared in _CORRELATIONS:
         tried = replace(config, shared=shared)
-        found = solve(keyframes, used_links, used_fixes, tried, False, used_steps).log_evidence
+        found = log_evidence(keyframes, used_links, used_fixes, tried, used_steps)
         logger.info("pass errors correlated by %.3f: log evidence %.2f", shared, found)
         if found > most:
             best, most = shared, found
+    if best == config.shared:
+        return first
     return solve(keyframes, links, fixes, replace(config, shared=best), steps=steps)

@@ -273,6 +273,36 @@ def _check(strips: Sequence[ElevationStrip]) -> None:
             f"the strips lie in different coordinate systems ({', '.join(names)}); "
             "give one for all with --crs EPSG:N"
         )
+    _refuse_two_places(strips)
+
+
+# Surveys with so much empty sea between them make no map of one piece.
+_FAR_M = 50_000.0
+
+
+def _refuse_two_places(strips: Sequence[ElevationStrip]) -> None:
+    """Refuse passes that lie in two places, squares of fifty kilometres having to touch."""
+    squares: dict[tuple[int, int], ElevationStrip] = {}
+    for strip in strips:
+        for line in (0, -1):
+            place = np.array([strip.easting_m[line], strip.northing_m[line]])
+            if np.isfinite(place).all():
+                east, north = np.floor(place / _FAR_M)
+                squares.setdefault((int(east), int(north)), strip)
+    left, reached = set(squares), list(squares)[:1]
+    while reached:
+        square = reached.pop()
+        left.discard(square)
+        reached += [s for s in left if max(abs(s[0] - square[0]), abs(s[1] - square[1])) <= 1]
+    if left:
+        first, other = next(iter(squares.values())), squares[min(left)]
+        apart = np.hypot(
+            first.easting_m[0] - other.easting_m[0], first.northing_m[0] - other.northing_m[0]
+        )
+        raise InputError(
+            f"{other.source or 'a pass'} lies {apart / 1000:.0f} km from {first.source or 'the first'}"
+            "; map surveys of different places (or UTM zones) each by itself"
+        )
 
 
 def _swath_width(strips: Sequence[ElevationStrip]) -> float:

@@ -111,3 +111,14 @@ def test_nothing_and_two_zones_are_refused(flown: list[Flight]) -> None:
     other = replace(flown[1].strip, crs="EPSG:32631")
     with pytest.raises(InputError, match="different coordinate systems"):
         correct_survey([flown[0].strip, other])
+
+
+def test_passes_in_two_places_are_refused_and_a_long_line_of_them_is_not(
+    flown: list[Flight],
+) -> None:
+    strip = replace(flown[0].strip, source="a.xtf")
+    far = replace(strip, easting_m=strip.easting_m + 400_000.0, source="b.xtf")
+    with pytest.raises(InputError, match=r"b\.xtf lies 400 km from a\.xtf"):
+        correct_survey([strip, far])
+    between = [replace(strip, easting_m=strip.easting_m + 45_000.0 * n) for n in range(10)]
+    assert len(correct_survey([*between, far], config=SurveyConfig(rounds=1)).strips) == 11
