@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapping.gridding import Window
+from mapping.passes import add_spread, add_weighted, judge
 from mapping.placed import PassRaster, PlacedStrip, boxes, extent, on_window, placed
 from perception.records import (
     BoolArray,
@@ -135,53 +136,42 @@ def combine(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Combine passes into mean, sigma of the mean and count, each of `shape`, rows south to north."""
     keep = [np.isfinite(r.height_m) for r in rasters]
+    sums = _sums(rasters, keep, shape)
     # Three rounds find up to three wrong passes in a cell; more than that and there is no majority.
     for _ in range(3):
-        if not _drop_worst(rasters, keep, shape):
+        if not _drop_worst(rasters, keep, sums):
             break
-    weight, total, number = _sums(rasters, keep, shape)
+        sums = _sums(rasters, keep, shape)
+    weight, total, number = sums
     filled = weight > 0
     safe = np.where(filled, weight, 1.0)
     mean = np.where(filled, total / safe, np.nan)
     chi2, position, count = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for r, k in zip(rasters, keep, strict=True):
-        w = np.where(k, 1.0 / r.variance_m2, 0.0)
-        residual = np.where(k, r.height_m - mean[r.window], 0.0)
-        chi2[r.window] += w * residual**2
-        position[r.window] += w * r.position_m2
-        count[r.window] += np.where(k, r.count, 0.0)
+        add_spread(r.height_m, r.variance_m2, r.position_m2, r.count, k, mean[r.window],
+                   chi2[r.window], position[r.window], count[r.window])  # fmt: skip
     disagreement = np.maximum(chi2 / np.maximum(number - 1, 1), 1.0)
     variance = disagreement / safe + _slope_squared(mean, cell_m) * position / safe
     return mean, np.where(filled, np.sqrt(variance), np.nan), count
 
 
 def _drop_worst(
-    rasters: Sequence[PassRaster], keep: list[BoolArray], shape: tuple[int, int]
+    rasters: Sequence[PassRaster], keep: Sequence[BoolArray], sums: Sequence[FloatArray]
 ) -> bool:
     """Drop from each cell the pass farthest beyond four sigma of the others' mean; tell if any was.
 
     A wrong pass must not pull the mean that it is judged by, so each is judged by the rest; and it spoils
     the rest of every other, so only the worst goes at a time.
     """
-    weight, total, number = _sums(rasters, keep, shape)
-    worst = np.full(shape, _OUTLIER_SIGMA)
-    ratios = []
-    for r, k in zip(rasters, keep, strict=True):
-        w = np.where(k, 1.0 / r.variance_m2, 0.0)
-        others = weight[r.window] - w
-        several = k & (number[r.window] >= 3) & (others > 1e-12)
-        safe = np.where(several, others, 1.0)
-        rest = (total[r.window] - w * np.where(k, r.height_m, 0.0)) / safe
-        expected = np.sqrt(np.where(k, r.variance_m2, 0.0) + 1.0 / safe)
-        ratio = np.where(several, np.abs(np.where(k, r.height_m, 0.0) - rest) / expected, 0.0)
-        worst[r.window] = np.maximum(worst[r.window], ratio)
-        ratios.append(ratio)
-    dropped = False
-    for index, (r, ratio) in enumerate(zip(rasters, ratios, strict=True)):
-        drop = (ratio > _OUTLIER_SIGMA) & (ratio >= worst[r.window])
-        dropped = dropped or bool(drop.any())
-        keep[index] = keep[index] & ~drop
-    return dropped
+    number = sums[2]
+    if number.max(initial=0.0) < 3:
+        return False
+    worst = np.full(number.shape, _OUTLIER_SIGMA)
+    for last in (False, True):
+        for r, k in zip(rasters, keep, strict=True):
+            judge(r.height_m, r.variance_m2, k, *(total[r.window] for total in sums),
+                  worst[r.window], _OUTLIER_SIGMA, last)  # fmt: skip
+    return bool((worst > _OUTLIER_SIGMA).any())
 
 
 def _sums(
@@ -189,10 +179,8 @@ def _sums(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     weight, total, number = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for r, k in zip(rasters, keep, strict=True):
-        w = np.where(k, 1.0 / r.variance_m2, 0.0)
-        weight[r.window] += w
-        total[r.window] += w * np.where(k, r.height_m, 0.0)
-        number[r.window] += k
+        add_weighted(r.height_m, r.variance_m2, k, weight[r.window], total[r.window],
+                     number[r.window])  # fmt: skip
     return weight, total, number
 
 

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapping.fusion import default_cell, fuse
+from mapping.fusion import combine, default_cell, fuse
 from mapping.gridding import COUNT, HEIGHT, WEIGHT, Spacing, Window, bin_lines
 from mapping.mosaic import echo_mosaic
 from mapping.objects import merge_objects, write_objects
+from mapping.placed import PassRaster
 from mapping.quality import crossing_differences, survey_quality
 from perception.objects import ObjectTable
 from perception.records import ElevationStrip, InputError
@@ -197,3 +198,50 @@ def test_two_objects_of_one_pass_never_merge() -> None:
     merged = merge_objects([a_table([(0, 0, "hill", 1.0, 0.1), (0.5, 0, "hill", 1.0, 0.1)], 0)])
     assert len(merged) == 2
     assert len(merge_objects([])) == 0
+
+
+def test_the_kernels_of_fusion_do_what_their_numpy_twins_do() -> None:
+    """Six passes on overlapping windows, two of them wild in places: mean, sigma and count, one by one cell."""
+    rng = np.random.default_rng(8)
+    shape, rasters = (40, 50), []
+    for k in range(6):
+        row0, col0 = rng.integers(0, 8, 2)
+        size = (40 - row0 - rng.integers(0, 5), 50 - col0 - rng.integers(0, 5))
+        height = -30.0 + 0.1 * rng.normal(size=size)
+        height[rng.random(size) < 0.1] = np.nan
+        if k > 3:
+            height[rng.random(size) < 0.3] += 3.0
+        variance = np.where(np.isfinite(height), rng.uniform(0.005, 0.02, size), np.nan)
+        position = rng.uniform(0, 0.1, size)
+        rasters.append(
+            PassRaster(
+                int(row0), int(col0), height, variance, position, rng.integers(0, 5, size) * 1.0
+            )
+        )
+    mean, _, count = combine(rasters, shape, 1.0)
+    for row in range(0, 40, 3):
+        for col in range(0, 50, 3):
+            here = []
+            for r in rasters:
+                i, j = row - r.row0, col - r.col0
+                inside = 0 <= i < r.height_m.shape[0] and 0 <= j < r.height_m.shape[1]
+                if inside and np.isfinite(r.height_m[i, j]):
+                    here.append((r.height_m[i, j], r.variance_m2[i, j], r.count[i, j]))
+            for _ in range(3):
+                ratios = []
+                for k, (h, v, _) in enumerate(here):
+                    others = here[:k] + here[k + 1 :]
+                    w = np.array([1 / o[1] for o in others])
+                    rest = (w @ [o[0] for o in others]) / w.sum() if len(others) > 1 else h
+                    ratios.append(
+                        abs(h - rest) / np.sqrt(v + 1 / w.sum()) if len(others) > 1 else 0.0
+                    )
+                if not ratios or max(ratios) <= 4.0:
+                    break
+                here.pop(int(np.argmax(ratios)))
+            if here:
+                w = np.array([1 / v for _, v, _ in here])
+                assert mean[row, col] == pytest.approx((w @ [h for h, _, _ in here]) / w.sum())
+                assert count[row, col] == sum(n for _, _, n in here)
+            else:
+                assert np.isnan(mean[row, col])
