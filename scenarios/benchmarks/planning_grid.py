@@ -92,8 +92,8 @@ def _fast_marching(weight: FloatArray, a: tuple[int, int], b: tuple[int, int]) -
     except ImportError:
         return None
     # The source is a circle of two cells, whose own cost is added: a point's first cells are of first order.
-    rows, cols = np.indices(weight.shape, sparse=True)
-    phi = np.hypot(rows - a[0], cols - a[1]) - 2.0
+    away = np.ogrid[-a[0] : weight.shape[0] - a[0], -a[1] : weight.shape[1] - a[1]]
+    phi = np.hypot(away[0], away[1]) - 2.0
     times, seconds = _timed(lambda: skfmm.travel_time(phi, 1.0 / weight, order=2))
     return float(times[b]) + 2.0 * float(weight[a]), seconds
 
