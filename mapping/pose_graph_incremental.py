@@ -50,6 +50,11 @@ class IncrementalGraph:
         self._step_factor: list[int | None] = []
         self._first_error = 0.0
 
+    @property
+    def links(self) -> tuple[Link, ...]:
+        """Every registration ever added, in order; `Solution.link_used` says which are still in."""
+        return tuple(self._links)
+
     def add_pass(self, keyframes: Keyframes, fixes: Sequence[KeyframeFix] = ()) -> None:
         """Add the last pass of `keyframes`, those of all passes so far, and fixes of it."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

@@ -35,6 +35,11 @@ logger = logging.getLogger(__name__)
 _LEAST_CELLS = 24
 
 
+def least_square_m(cell_m: float) -> float:
+    """Return the width of the smallest square that is worth comparing."""
+    return _LEAST_CELLS * cell_m
+
+
 @dataclass(frozen=True, slots=True)
 class SurveyConfig:
     """How a survey is corrected.
@@ -156,8 +161,8 @@ def correct_survey(
         No strip, or strips in different coordinate systems.
     """
     config = config or SurveyConfig()
-    _check(strips)
-    keyframes = choose_keyframes(strips, config.keyframe_m or _swath_width(strips) / 12.0)
+    check(strips)
+    keyframes = choose_keyframes(strips, config.keyframe_m or swath_width(strips) / 12.0)
     ties = tie_fixes(fixes, strips, keyframes, config.graph.drift_m_per_sqrt_km)
     cell_m = config.match.cell_m or default_cell(strips)
     settled_m = config.settled_m or 0.2 * cell_m
@@ -171,7 +176,7 @@ def correct_survey(
     steps: list[HeightStep] = []
     for number in range(config.rounds or len(squares)):
         part = squares[min(number, len(squares) - 1)]
-        side_m = max(part * _swath_width(strips), _LEAST_CELLS * cell_m)
+        side_m = max(part * swath_width(strips), least_square_m(cell_m))
         corrected = on_track(thin, keyframes, solution)
         results, links = register(
             corrected, textures, keyframes, solution, find_overlaps(corrected, side_m), cell_m,
@@ -203,7 +208,7 @@ def correct_survey(
             break
     if links:
         solution = solve_shared(keyframes, links, ties, config.graph, steps)
-    return _result(strips, keyframes, solution, found, links, ties, steps, rounds, config)
+    return assemble(strips, keyframes, solution, found, links, ties, steps, rounds, config)
 
 
 def tie_to_map(
@@ -222,7 +227,7 @@ def tie_to_map(
     """
     config = config or SurveyConfig()
     keyframes, before = corrected.keyframes, corrected.solution
-    side_m = 0.5 * _swath_width(strips)
+    side_m = 0.5 * swath_width(strips)
     ties = ties_to_prior(draft, prior, keyframes, before, config.graph, side_m)
     said = replace(corrected.diagnostics, prior_compared=ties.compared)
     if not ties.fixes:
@@ -230,7 +235,7 @@ def tie_to_map(
     every = (*corrected.ties, *ties.fixes)
     solution = solve_shared(keyframes, corrected.links, every, config.graph, corrected.steps)
     shift_m = (solution.correction_m - before.correction_m).mean(axis=0)
-    tied = _result(
+    tied = assemble(
         strips, keyframes, solution, corrected.registrations, corrected.links, every,
         corrected.steps, said.rounds, config,
     )  # fmt: skip
@@ -264,7 +269,14 @@ def gain_in_likeness(before: CorrectedSurvey, after: CorrectedSurvey) -> float:
     return new.evidence / old.evidence - 1.0
 
 
-def _check(strips: Sequence[ElevationStrip]) -> None:
+def check(strips: Sequence[ElevationStrip]) -> None:
+    """Refuse strips that cannot be one survey.
+
+    Raises
+    ------
+    InputError
+        No strip, several coordinate systems, or places far apart.
+    """
     if not strips:
         raise InputError("the survey holds no strip; was a pass of ten pings or more found?")
     names = sorted({strip.crs for strip in strips})
@@ -305,7 +317,7 @@ def _refuse_two_places(strips: Sequence[ElevationStrip]) -> None:
         )
 
 
-def _swath_width(strips: Sequence[ElevationStrip]) -> float:
+def swath_width(strips: Sequence[ElevationStrip]) -> float:
     """Return the median width of what the strips show."""
     widths = []
     for strip in strips:
@@ -315,7 +327,7 @@ def _swath_width(strips: Sequence[ElevationStrip]) -> float:
     return max(float(np.median(widths)), 1.0) if widths else 50.0
 
 
-def _result(
+def assemble(
     strips: Sequence[ElevationStrip],
     keyframes: Keyframes,
     solution: Solution,
@@ -326,6 +338,7 @@ def _result(
     rounds: Sequence[Round],
     config: SurveyConfig,
 ) -> CorrectedSurvey:
+    """Put a solved graph into the survey's own terms: strips on their track, poses with covariance."""
     corrected = on_track(strips, keyframes, solution)
     q2 = config.graph.drift_m_per_sqrt_km**2 / 1000.0
     covariances = []

@@ -1,0 +1,128 @@
+"""A survey that grows while it is sailed: a pass arrives, is matched with what it overlaps, and the track is updated.
+
+Only the new pass is registered and only what it touches is solved anew (iSAM2). The graph that results is the
+batch's on the same registrations; those were made with what was known when their pass came, so a batch over all passes
+at the end may differ by a part of its sigma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mapping.crossings import height_steps
+from mapping.fixes import PositionFix
+from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
+from mapping.overlaps import Window, find_overlaps
+from mapping.placing import on_track
+from mapping.pose_graph import HeightStep, Link, Solution, solve
+from mapping.pose_graph_incremental import IncrementalGraph
+from mapping.registration import Match
+from mapping.rounds import Registration, TextureStore, register
+from mapping.survey import (
+    CorrectedSurvey,
+    SurveyConfig,
+    assemble,
+    check,
+    least_square_m,
+    swath_width,
+)
+from mapping.textures import default_cell, thinned
+from perception.records import ElevationStrip, Progress, silent
+
+
+class IncrementalSurvey:
+    """Strips in, one after the other; the corrected survey so far out.
+
+    Parameters
+    ----------
+    config : as for `correct_survey`. Cells and keyframes follow the first pass where it does not say.
+    fixes_to_come : whether absolute fixes will decide where the survey lies.
+    """
+
+    def __init__(self, config: SurveyConfig | None = None, fixes_to_come: bool = False) -> None:
+        self._config = config or SurveyConfig()
+        self._graph = IncrementalGraph(self._config.graph, fixes_to_come)
+        self._strips: list[ElevationStrip] = []
+        self._thin: list[ElevationStrip] = []
+        self._textures = TextureStore(self._thin, self._config.match)
+        self._ties: list[KeyframeFix] = []
+        self._steps: list[HeightStep] = []
+        self._cell_m = self._keyframe_m = float("nan")
+
+    def add_pass(
+        self,
+        strip: ElevationStrip,
+        fixes: Sequence[PositionFix] = (),
+        progress: Progress = silent,
+    ) -> CorrectedSurvey:
+        """Add a pass, and the fixes that belong to it; return the survey so far.
+
+        Raises
+        ------
+        InputError
+            The pass cannot be of one survey with the earlier ones.
+        """
+        check([*self._strips, strip])
+        config = self._config
+        if not self._strips:
+            self._cell_m = config.match.cell_m or default_cell([strip])
+            self._keyframe_m = config.keyframe_m or swath_width([strip]) / 12.0
+        self._strips.append(strip)
+        self._thin.append(thinned(strip, 0.6 * self._cell_m))
+        keyframes = choose_keyframes(self._strips, self._keyframe_m)
+        ties = tie_fixes(fixes, self._strips, keyframes, config.graph.drift_m_per_sqrt_km)
+        self._ties += ties
+        self._graph.add_pass(keyframes, ties)
+        found = self._match(keyframes, progress)
+        solution = self._graph.solution()
+        used = iter(solution.link_used[len(self._graph.links) - len(found[1]) :])
+        registrations = [
+            Registration(w, m, bool(next(used)) if m.accepted else False) for w, m in found[0]
+        ]
+        return assemble(
+            self._strips, keyframes, solution, registrations, self._graph.links, self._ties,
+            self._steps, (), config,
+        )  # fmt: skip
+
+    def _match(
+        self, keyframes: Keyframes, progress: Progress
+    ) -> tuple[list[tuple[Window, Match]], list[Link]]:
+        """Register the newest pass by narrowing squares; leave the last round's links in the graph."""
+        config, graph, new = self._config, self._graph, len(self._strips) - 1
+        solution = graph.solution()
+        results: list[tuple[Window, Match]] = []
+        links: list[Link] = []
+        for number, part in enumerate(config.squares, start=1):
+            corrected = on_track(self._thin, keyframes, solution)
+            side_m = max(part * swath_width(self._strips), least_square_m(self._cell_m))
+            windows = [w for w in find_overlaps(corrected, side_m) if w.second == new]
+            results, links = register(
+                corrected, self._textures, keyframes, solution, windows, self._cell_m,
+                config.match, config.graph, config.widest_search_m, None, progress,
+                f"pass {new + 1}, round {number}",
+            )  # fmt: skip
+            last = number == len(config.squares)
+            steps = [
+                step
+                for step in (height_steps(corrected, keyframes, solution, links) if last else ())
+                if step.second == new
+            ]
+            before = len(graph.links)
+            graph.add_links(links, steps)
+            self._steps += steps
+            solution = self._doubted(keyframes, before)
+            if not last:
+                graph.take_out(range(before, len(graph.links)))
+        return results, links
+
+    def _doubted(self, keyframes: Keyframes, first: int) -> Solution:
+        """Take out the links from `first` on that contradict the rest (GNC knows no increments)."""
+        graph = self._graph
+        present = graph.solution().link_used
+        kept = [link for link, ok in zip(graph.links, present, strict=True) if ok]
+        judged = solve(keyframes, kept, self._ties, self._config.graph, steps=self._steps)
+        numbers = np.flatnonzero(present)[~judged.link_used]
+        graph.take_out([int(n) for n in numbers if n >= first])
+        return graph.solution()
