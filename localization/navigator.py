@@ -58,7 +58,7 @@ class NavigatorConfig:
     hand_over_m : largest sigma of an axis at which the Kalman bank takes over.
     probation : updates, at least, before a match is called converged.
     proof : log of the likelihood ratio, of map against free ground, that proves a match.
-    converged_m : largest sigma of an axis of a converged state.
+    converged_m : largest sigma of an axis of a converged state: an error of 25 m is then beyond three.
     walk_m_sqrt_h : random walk of dead reckoning assumed during the search.
     reset_depth_m : depth bias to allow for when the filter starts again: the cause may be a step.
     grow : factor of the box from one search to the next.
@@ -68,7 +68,7 @@ class NavigatorConfig:
     hand_over_m: float = 12.0
     probation: int = 6
     proof: float = 6.0
-    converged_m: float = 12.0
+    converged_m: float = 8.0
     walk_m_sqrt_h: float = 4.0
     reset_depth_m: float = 10.0
     grow: float = 2.0

@@ -113,7 +113,7 @@ def _cep(axes: Any, table: Any, groups: list[Group]) -> None:
     axes.set(yscale="log", ylabel="error over the second half, m (median of runs)")
     axes.margins(y=0.15)
     _name_groups(axes, groups)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, markerscale=0.4)
 
 
 def _consistency(axes: Any, table: Any, groups: list[Group]) -> None:
