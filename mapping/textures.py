@@ -139,6 +139,7 @@ def thinned(strip: ElevationStrip, width_m: float) -> ElevationStrip:
         echo=mean(strip.echo),
         shadow=np.add.reduceat(strip.shadow.astype(np.float32), first, axis=1) > 0.5 * size,
         across_m=np.add.reduceat(strip.across_m, first) / size,
+        flags=None if strip.flags is None else np.bitwise_or.reduceat(strip.flags, first, axis=1),
     )
 
 

@@ -147,6 +147,7 @@ class ElevationStrip:
     time_s, ping, easting_m, northing_m, depth_m, heading_rad, altitude_m, altitude_sigma_m : (n,).
     lead_m : (n,) how far ahead of the sonar the line lies, by its pitch (`perception.attitude`); None
         nowhere.
+    flags : (n, m) uint8, bits of `perception.quality.CellFlag`; None where nothing is known.
     """
 
     elevation_m: FloatArray
@@ -166,11 +167,12 @@ class ElevationStrip:
     source: str = ""
     pass_index: int = 0
     lead_m: FloatArray | None = None
+    flags: IntArray | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.time_s), len(self.across_m))
-        for name in ("elevation_m", "sigma_m", "echo", "shadow"):
-            if getattr(self, name).shape != shape:
+        for name in ("elevation_m", "sigma_m", "echo", "shadow", "flags"):
+            if getattr(self, name) is not None and getattr(self, name).shape != shape:
                 raise ValueError(
                     f"ElevationStrip.{name} must have shape {shape} (lines, columns), "
                     f"got {getattr(self, name).shape}"

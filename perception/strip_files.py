@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from perception.files import existing_file, whole_file
+from perception.quality import CellFlag
 from perception.records import ElevationStrip, InputError
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def strip_dataset(strip: ElevationStrip, utc: bool = True) -> xarray.Dataset:
     """Return a strip as a labelled data set: units, names, CRS and provenance in attributes."""
     import xarray
 
-    variables = {}
+    variables: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, object]]] = {}
     for name, (dimensions, units, long_name, standard) in _VARIABLES.items():
         if getattr(strip, name) is None:
             continue
@@ -49,7 +50,7 @@ def strip_dataset(strip: ElevationStrip, utc: bool = True) -> xarray.Dataset:
             values = values.astype(np.int8)
         elif len(dimensions) == 2:
             values = values.astype(np.float32)
-        attributes = {"long_name": long_name}
+        attributes: dict[str, object] = {"long_name": long_name}
         if name == "time_s":
             attributes["units"] = "seconds since 1970-01-01T00:00:00Z" if utc else "s"
         else:
@@ -57,6 +58,8 @@ def strip_dataset(strip: ElevationStrip, utc: bool = True) -> xarray.Dataset:
         if standard:
             attributes["standard_name"] = standard
         variables[name] = (dimensions, values, attributes)
+    if strip.flags is not None:
+        variables["flags"] = (("line", "column"), strip.flags.astype(np.uint8), _flag_attributes())
     return xarray.Dataset(
         variables,
         attrs={
@@ -69,13 +72,26 @@ def strip_dataset(strip: ElevationStrip, utc: bool = True) -> xarray.Dataset:
     )
 
 
+def _flag_attributes() -> dict[str, object]:
+    """Return what CF asks of a variable of bits: a mask and a word for each."""
+    return {
+        "long_name": "quality flags",
+        "flag_masks": np.array([flag.value for flag in CellFlag], np.uint8),
+        "flag_meanings": " ".join(str(flag.name).lower() for flag in CellFlag),
+    }
+
+
 def write_strip(path: Path, strip: ElevationStrip, utc: bool = True) -> None:
     """Write a strip to `path` (NetCDF-4), whole or not at all."""
     data = strip_dataset(strip, utc)
     # Chunks of whole lines: a tile of the map reads the lines that touch it, not the strip.
     lines, columns = strip.elevation_m.shape
-    squeezed = {"zlib": True, "complevel": 1, "chunksizes": (min(lines, CHUNK_LINES), columns)}
-    encoding = {
+    squeezed: dict[str, object] = {
+        "zlib": True,
+        "complevel": 1,
+        "chunksizes": (min(lines, CHUNK_LINES), columns),
+    }
+    encoding: dict[str, dict[str, object]] = {
         name: squeezed for name, (dimensions, *_) in _VARIABLES.items() if len(dimensions) == 2
     }
     with whole_file(path) as temporary:
@@ -104,6 +120,8 @@ def read_strip(path: Path) -> ElevationStrip:
                     f"{path}: lacks {missing[0]}; give a strip written by `bathynav strips`"
                 )
             values = {name: data[name].to_numpy() for name in _VARIABLES if name in data}
+            if "flags" in data:
+                values["flags"] = data["flags"].to_numpy().astype(np.uint8)
             attributes = dict(data.attrs)
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):

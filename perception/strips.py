@@ -13,6 +13,7 @@ import numpy as np
 
 from perception.attitude import levelled
 from perception.bottom import BottomConfig, BottomTrack, track_bottom
+from perception.bottom_files import GivenBottom
 from perception.contours import (
     Roughness,
     floor_beside,
@@ -24,9 +25,16 @@ from perception.gain import Equalised, GainConfig, equalise
 from perception.geometry import progress_along, resample_rows
 from perception.levels import SHADOW, LevelConfig, Levels, segment_levels
 from perception.objects import ObjectConfig, ObjectRow, ObjectTable, Track, find_objects
-from perception.records import ElevationStrip, FloatArray, InputError, IntArray, Swath
+from perception.quality import cell_flags, saturated_samples
+from perception.readers.raw import PingFlag
+from perception.records import BoolArray, ElevationStrip, FloatArray, InputError, IntArray, Swath
+from perception.unseen import hidden_sigma
 
 logger = logging.getLogger(__name__)
+
+
+# A ping with more of its samples at the recorder's ceiling is flagged as a whole.
+_MANY_SATURATED = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +46,7 @@ class StripConfig:
     cell_m : width of the strip's columns across the track; None takes twice the sample, no more than
         500 columns a side.
     bottom, gain, levels, objects : settings of the stages.
+    given_bottom : a bottom track from a file, taken in place of the tracker's.
     """
 
     cell_m: float | None = None
@@ -45,6 +54,7 @@ class StripConfig:
     gain: GainConfig = field(default_factory=GainConfig)
     levels: LevelConfig = field(default_factory=LevelConfig)
     objects: ObjectConfig = field(default_factory=ObjectConfig)
+    given_bottom: GivenBottom | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +73,8 @@ class PassResult:
         with another are resampled).
     along_m : (n,) distance along the pass.
     roughness : variogram of the floor, learned from the soundings.
-    flags : (n,) int, 1 where no bottom was seen; the swath's own flags shifted left by one bit.
+    tracked : the bottom as it was tracked (or given), before lines were levelled together.
+    flags : (n,) bits of `PingFlag`.
     """
 
     strip: ElevationStrip
@@ -75,6 +86,7 @@ class PassResult:
     sample_m: float
     along_m: FloatArray
     roughness: Roughness
+    tracked: BottomTrack
     flags: IntArray
 
 
@@ -93,7 +105,11 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
             "at least 10 are needed"
         )
     port, starboard, sample_m = common_samples(swath)
-    bottom = track_bottom(port, starboard, sample_m, swath.altitude_hint_m, config.bottom)
+    if config.given_bottom is not None:
+        bottom = config.given_bottom.of(swath)
+    else:
+        bottom = track_bottom(port, starboard, sample_m, swath.altitude_hint_m, config.bottom)
+    tracked = bottom
     if not bottom.valid.any():
         raise InputError(
             f"{swath.source or 'swath'}: pass {swath.pass_index} shows no bottom in "
@@ -139,20 +155,23 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
         swath, level, along_m, depth_m, line_m, line_sigma, sides, sample_m, rough, rows, config
     )
     strip, floor = (replace(s, lead_m=lead_m) for s in (strip, floor))
-    flags = np.where(bottom.valid, 0, 1)
-    if swath.flags is not None:
-        flags = flags | (np.asarray(swath.flags) << 1)
+    levels = sides[0][1].label, sides[1][1].label
+    echo = sides[0][0].ratio, sides[1][0].ratio
+    saturated = saturated_samples(port), saturated_samples(starboard)
+    cells = cell_flags(swath, saturated, levels, echo, bottom.valid, along_m, altitude_m,
+                       strip.across_m, sample_m)  # fmt: skip
     return PassResult(
-        strip=strip,
-        floor=floor,
+        strip=replace(strip, flags=cells),
+        floor=replace(floor, flags=cells),
         objects=ObjectTable.of(rows),
         bottom=level,
-        echo=(sides[0][0].ratio, sides[1][0].ratio),
-        levels=(sides[0][1].label, sides[1][1].label),
+        echo=echo,
+        levels=levels,
         sample_m=sample_m,
         along_m=along_m,
         roughness=rough,
-        flags=flags,
+        tracked=tracked,
+        flags=_ping_flags(swath, bottom.valid, saturated),
     )
 
 
@@ -172,6 +191,15 @@ def common_samples(swath: Swath) -> tuple[FloatArray, FloatArray, float]:
         resample_rows(starboard, own, common, count),
         common,
     )
+
+
+def _ping_flags(swath: Swath, valid: BoolArray, saturated: tuple[BoolArray, BoolArray]) -> IntArray:
+    """Return the swath's own flags with what its echoes add: no bottom, and many saturated samples."""
+    flags = np.zeros(swath.n_pings, np.int64) if swath.flags is None else np.array(swath.flags)
+    flags[~valid] |= int(PingFlag.NO_BOTTOM)
+    share = np.mean(np.concatenate(saturated, axis=1), axis=1)
+    flags[share > _MANY_SATURATED] |= int(PingFlag.SATURATED)
+    return flags
 
 
 def _depth(swath: Swath) -> FloatArray:
@@ -211,7 +239,7 @@ def _strip(
     bare, bare_sigma = (np.where(seen, v, np.nan).astype(np.float32) for v in (elevation, sigma))
     for row in rows:
         _add_object(elevation, sigma, row, across, along_m)
-    # Ground in shadow was not heard: the object's own sigma at least.
+    sigma = np.hypot(sigma, hidden_sigma(shadow, across, bottom.altitude_m))
     elevation = np.where(seen, elevation, np.nan)
     sigma = np.where(seen, sigma, np.nan)
     strip = ElevationStrip(

@@ -179,6 +179,7 @@ def _columns(one: FiledPass) -> ElevationStrip:
         echo=two,
         shadow=two > 0,
         across_m=np.array([0, step]),
+        flags=None,
     )
 
 

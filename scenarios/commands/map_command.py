@@ -22,6 +22,7 @@ _FIX_REACH_S = 3600.0  # fixes further from every ping say nothing of the survey
 
 if TYPE_CHECKING:
     from mapping.fixes import PositionFix
+    from perception.bottom_files import GivenBottom
     from perception.readers import Survey
     from perception.records import Grid, Progress
 
@@ -58,6 +59,9 @@ class _Tiling:
 @click.option("--install", type=click.Path(path_type=Path), help="Lever arms and mounting, TOML.")
 @click.option("--tide", type=click.Path(path_type=Path), help="Tide, a CSV file.")
 @click.option("--sound-speed", metavar="M_S|PROFILE.csv", help="Sound speed, or its profile.")
+@click.option(
+    "--bottom", type=click.Path(path_type=Path), help="Bottom track to use: a bottom.csv of strips."
+)
 @click.option(
     "--method",
     type=click.Choice(["joint", "shadow"]),
@@ -99,6 +103,7 @@ def command(
     install: Path | None,
     tide: Path | None,
     sound_speed: str | None,
+    bottom: Path | None,
     method: str | None,
     fill_m: float | None,
     also: tuple[str, ...],
@@ -119,6 +124,7 @@ def command(
 
     from mapping.fixes import read_fixes
     from mapping.rasters import read_map
+    from perception.bottom_files import read_bottom
     from perception.installation import read_installation
     from perception.readers import open_survey
     from scenarios.outputs import write_metrics
@@ -129,6 +135,7 @@ def command(
     absolute = read_fixes(fixes) if fixes is not None else []
     old = read_map(prior) if prior is not None else None
     installation = read_installation(install, tide, sound_speed)
+    given = read_bottom(bottom) if bottom is not None else None
     began = time.perf_counter()
     with progress_bars(quiet) as progress:
         survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
@@ -140,14 +147,17 @@ def command(
         tiling = _Tiling(tiles, tile_cells, scheduler, workers)
         method, in_tiles = _choose(survey, cell, method, tiling, quiet)
         if in_tiles:
+            _refuse_bottom(bottom)
             metrics = _in_tiles(out, survey, absolute, cell, tiling, old, fill_m, progress)
         else:
-            metrics = _in_one_piece(out, survey, absolute, cell, method, old, fill_m, progress)
+            metrics = _in_one_piece(
+                out, survey, absolute, cell, method, old, fill_m, given, progress
+            )
         _export(out, also)
     config = {
         "surveys": [str(p) for p in surveys], "cell_m": cell, "crs": survey.crs, "method": method,
         "prior": prior, "fixes": fixes, "install": install, "tide": tide,
-        "sound_speed": sound_speed, "tile_cells": tile_cells if in_tiles else None,
+        "sound_speed": sound_speed, "bottom": bottom, "tile_cells": tile_cells if in_tiles else None,
         "also": list(also) or None, "fill_m": fill_m,
     }  # fmt: skip
     metrics["seconds"] = time.perf_counter() - began
@@ -204,6 +214,15 @@ def _choose(
     return "shadow", True
 
 
+def _refuse_bottom(bottom: Path | None) -> None:
+    from perception.records import InputError
+
+    if bottom is not None:
+        raise InputError(
+            f"--bottom {bottom}: a map in tiles tracks its own bottom; leave --tiles out, or --bottom"
+        )
+
+
 def _in_one_piece(
     out: Path,
     survey: Survey,
@@ -212,13 +231,24 @@ def _in_one_piece(
     method: str,
     old: Grid | None,
     fill_m: float | None,
+    given: GivenBottom | None,
     progress: Progress,
 ) -> dict[str, Any]:
+    from perception.strips import StripConfig
     from scenarios.map_files import tie_to_prior, write_whole
-    from scenarios.survey_map import map_survey
+    from scenarios.survey_map import build_passes, map_survey
 
+    passes = None
+    if given is not None:
+        passes = build_passes(survey, progress, StripConfig(given_bottom=given))
     result = map_survey(
-        survey, fixes=fixes, cell_m=cell_m, method=method, prior=old, progress=progress
+        survey,
+        fixes=fixes,
+        cell_m=cell_m,
+        method=method,
+        passes=passes,
+        prior=old,
+        progress=progress,
     )
     # Tied before anything is written: every file of the folder is of one height.
     tie = None if old is None else tie_to_prior(result.grid, old)

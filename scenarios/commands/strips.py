@@ -19,6 +19,7 @@ from scenarios.commands.console import (
 if TYPE_CHECKING:
     from perception.objects import ObjectTable
     from perception.strips import PassResult
+    from scenarios.report.contacts import Contact
 
 
 @click.command()
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
 @click.option("--install", type=click.Path(path_type=Path), help="Lever arms and mounting, TOML.")
 @click.option("--tide", type=click.Path(path_type=Path), help="Tide, a CSV file.")
 @click.option("--sound-speed", metavar="M_S|PROFILE.csv", help="Sound speed, or its profile.")
+@click.option(
+    "--bottom", type=click.Path(path_type=Path), help="Bottom track to use: a bottom.csv, edited."
+)
 @common_options
 def command(
     surveys: tuple[Path, ...],
@@ -42,18 +46,21 @@ def command(
     install: Path | None,
     tide: Path | None,
     sound_speed: str | None,
+    bottom: Path | None,
     quiet: bool,
     verbose: bool,
 ) -> None:
     """Turn each pass in SURVEY files into an elevation strip: strip-NNN.nc and a picture.
 
-    objects.csv lists hills and craters of all passes with heights and 1-sigma.
+    objects.csv lists hills and craters of all passes with heights and 1-sigma, contacts.html shows
+    them; bottom.csv is the bottom track, which may be edited and given back by --bottom.
 
     \b
     bathynav strips survey.xtf --out strips
     """
     import time
 
+    from perception.bottom_files import bottom_rows, read_bottom, write_bottom_csv
     from perception.installation import read_installation
     from perception.objects import ObjectTable, write_objects_csv
     from perception.readers import open_survey
@@ -61,15 +68,22 @@ def command(
     from perception.strips import StripConfig
     from scenarios.outputs import write_metrics
     from scenarios.plots_strips import plot_pass
+    from scenarios.report.contacts import contacts_of, write_contacts
     from scenarios.survey_map import build_passes
 
     set_verbosity(quiet, verbose)
     prepare_out(out)
     _clear(out)
-    config = None if cell is None else StripConfig(cell_m=cell)
+    given = None if bottom is None else read_bottom(bottom)
+    # The mission's map reuses strips made with the default settings, which are told by None.
+    config = (
+        None if cell is None and given is None else StripConfig(cell_m=cell, given_bottom=given)
+    )
     installation = read_installation(install, tide, sound_speed)
     began = time.perf_counter()
     measured: dict[str, float] = {}
+    contacts: list[Contact] = []
+    bottoms: list[str] = []
     with progress_bars(quiet) as progress:
         survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
         if not quiet:
@@ -79,16 +93,25 @@ def command(
         def write(index: int, result: PassResult) -> None:
             write_strip(out / f"strip-{index:03d}.nc", result.strip, survey.utc)
             plot_pass(out / f"strip-{index:03d}.png", result)
+            contacts.extend(contacts_of(result))
+            strip = result.strip
+            bottoms.extend(bottom_rows(strip.time_s, strip.ping, strip.pass_index, result.tracked,
+                                       survey.utc, given is not None))  # fmt: skip
             _add_up(measured, result)
 
         # One pass in memory at a time: a survey may be larger than memory.
         tables = [p.objects for p in build_passes(survey, progress, config, write)]
     objects = ObjectTable.joined(tables)
     write_objects_csv(out / "objects.csv", objects)
+    write_bottom_csv(out / "bottom.csv", bottoms)
+    title = ", ".join(path.name for path in surveys[:3]) + (" ..." if len(surveys) > 3 else "")
+    write_contacts(out / "contacts.html", contacts, title, survey.crs)
     metrics = _metrics(measured, objects, len(tables), time.perf_counter() - began)
     write_metrics(
-        out, metrics, {"surveys": [str(p) for p in surveys], "crs": survey.crs, "cell_m": cell}
-    )
+        out, metrics,
+        {"surveys": [str(p) for p in surveys], "crs": survey.crs, "cell_m": cell,
+              "bottom": bottom},
+    )  # fmt: skip
     if not quiet:
         print_table("strips", [(name, _shown(value)) for name, value in metrics.items()])
         click.echo(f"written to {out}")

@@ -56,7 +56,8 @@ def test_a_survey_becomes_strips_objects_pictures_and_metrics(survey: Path, tmp_
     done = _run(survey, "--out", out)
     assert done.returncode == 0, done.stderr
     assert sorted(p.name for p in out.iterdir()) == [
-        "config.toml", "metrics.json", "objects.csv", "strip-000.nc", "strip-000.png",
+        "bottom.csv", "config.toml", "contacts.html", "metrics.json", "objects.csv", "strip-000.nc",
+        "strip-000.png",
     ]  # fmt: skip
     strip = read_strip(out / "strip-000.nc")
     assert np.nanmedian(strip.elevation_m) == pytest.approx(-30, abs=0.1)
@@ -104,3 +105,20 @@ def test_a_real_wreck_becomes_a_strip_with_shadow_where_the_image_has_it(tmp_pat
     starboard = strip.shadow[:, strip.across_m > 0].mean()
     assert starboard > 0.05 and starboard > 4 * strip.shadow[:, strip.across_m < 0].mean()
     assert np.isfinite(strip.elevation_m).mean() > 0.9
+
+
+def test_a_bottom_edited_by_hand_goes_into_strips_and_map(survey: Path, tmp_path: Path) -> None:
+    assert _run(survey, "--out", tmp_path / "first", "-q").returncode == 0
+    lines = (tmp_path / "first" / "bottom.csv").read_text().splitlines()
+    edited = [lines[0]]
+    for line in lines[1:]:
+        cells = line.split(",")
+        cells[4] = f"{float(cells[4]) - 1:.3f}"
+        edited.append(",".join(cells))
+    (tmp_path / "edited.csv").write_text("\n".join(edited) + "\n")
+    given = ("--bottom", tmp_path / "edited.csv", "-q")
+    assert _run(survey, "--out", tmp_path / "again", *given).returncode == 0
+    first, again = (read_strip(tmp_path / name / "strip-000.nc") for name in ("first", "again"))
+    assert np.median(first.altitude_m - again.altitude_m) == pytest.approx(1.0, abs=0.05)
+    wrong = _run(survey, "--out", tmp_path / "wrong", "--bottom", tmp_path / "none.csv")
+    assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and "none.csv" in wrong.stderr

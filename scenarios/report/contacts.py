@@ -1,0 +1,199 @@
+"""`contacts.html`: every object found, with the echo that shows it; one file that opens without a network."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from perception.files import write_text
+from perception.geodesy import GEOGRAPHIC, is_local, transform
+from perception.records import FloatArray
+from perception.strips import PassResult
+
+# A snippet shows so many shadow lengths (and at least metres) about its object, on so many dots a side.
+_LEAST_M, _MOST_DOTS = 3.0, 180
+# Beyond this many contacts a page is no report; the least likely are left to objects.csv.
+_MOST = 400
+# Contacts of two passes and kinds nearer than this (or their own size) dispute each other.
+_SAME_M = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """One object of one pass as the page shows it; metres, `snippet` a PNG."""
+
+    easting_m: float
+    northing_m: float
+    kind: str
+    height_m: float
+    sigma_m: float
+    lower_bound: bool
+    probability: float
+    slant_range_m: float
+    shadow_length_m: float
+    across_m: float
+    half_size_m: float
+    pass_index: int
+    ping: int
+    snippet: bytes
+
+
+def contacts_of(result: PassResult) -> list[Contact]:
+    """Return the contacts of one pass with their echo snippets."""
+    table = result.objects
+    return [
+        Contact(
+            easting_m=float(table.easting_m[i]),
+            northing_m=float(table.northing_m[i]),
+            kind=table.kind[i],
+            height_m=float(table.height_m[i]),
+            sigma_m=float(table.sigma_m[i]),
+            lower_bound=bool(table.lower_bound[i]),
+            probability=float(table.probability[i]),
+            slant_range_m=float(table.slant_range_m[i]),
+            shadow_length_m=float(table.shadow_length_m[i]),
+            across_m=float(table.across_m[i]),
+            half_size_m=float(max(table.half_across_m[i], table.half_along_m[i])),
+            pass_index=int(table.pass_index[i]),
+            ping=int(table.ping[i]),
+            snippet=_snippet(result, i),
+        )
+        for i in range(len(table))
+    ]
+
+
+def _snippet(result: PassResult, i: int) -> bytes:
+    """Return a PNG of the echo about object `i`: along the track to the right, range upwards, square dots."""
+    table = result.objects
+    echo = result.echo[int(table.across_m[i] > 0)]
+    start_m, length_m = float(table.slant_range_m[i]), float(table.shadow_length_m[i])
+    half_m = max(_LEAST_M, float(table.half_along_m[i]) * 2, 0.75 * length_m)
+    middle_m = start_m + 0.4 * length_m
+    step_m = max(2 * half_m / _MOST_DOTS, result.sample_m)
+    lines = np.arange(table.along_m[i] - half_m, table.along_m[i] + half_m, step_m)
+    ranges = np.arange(middle_m - half_m, middle_m + half_m, step_m)
+    rows = np.searchsorted(result.along_m, lines)
+    columns = np.round(ranges / result.sample_m - 0.5).astype(int)
+    inside = ((rows > 0) & (rows < len(echo)))[:, None] & (
+        (columns >= 0) & (columns < echo.shape[1])
+    )
+    values = echo[np.clip(rows, 0, len(echo) - 1)[:, None], np.clip(columns, 0, echo.shape[1] - 1)]
+    return _png(np.where(inside, values, np.nan))
+
+
+def _png(ratio: FloatArray) -> bytes:
+    """Draw power over nominal in decibels, -15 black to 10 white; what was not heard is blue."""
+    from matplotlib import colormaps, image
+
+    grey = colormaps["gray"].with_extremes(bad="#20304a")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        decibels = 10 * np.log10(np.maximum(ratio, 1e-3))
+    buffer = io.BytesIO()
+    image.imsave(buffer, np.ma.masked_invalid(decibels.T), vmin=-15, vmax=10, cmap=grey,
+                 origin="lower", format="png")  # fmt: skip
+    return buffer.getvalue()
+
+
+def write_contacts(path: Path, contacts: Sequence[Contact], title: str, crs: str) -> None:
+    """Write the page, likeliest contacts first; no contact gives a page that says so."""
+    ranked = sorted(contacts, key=lambda contact: -contact.probability)
+    shown, disputed = ranked[:_MOST], _disputed(ranked)
+    places = _places(shown, crs)
+    cards = "\n".join(
+        _card(number, contact, place, contact in disputed)
+        for number, (contact, place) in enumerate(zip(shown, places, strict=True), start=1)
+    )
+    hills = sum(contact.kind == "hill" for contact in contacts)
+    said = f"{len(contacts)} contacts: {hills} hills, {len(contacts) - hills} craters"
+    if len(contacts) > len(shown):
+        said += f"; the {len(shown)} likeliest are shown, all are in objects.csv"
+    said += "."
+    if not contacts:
+        said = "No contact stands out of the floor's own relief."
+    write_text(
+        path,
+        _PAGE.format(
+            title=html.escape(title), said=said, crs=html.escape(_short(crs)), cards=cards
+        ),
+    )
+
+
+def _disputed(contacts: Sequence[Contact]) -> set[Contact]:
+    """Return contacts at whose place another pass saw the other kind."""
+    found: set[Contact] = set()
+    places = np.array([(c.easting_m, c.northing_m) for c in contacts]).reshape(-1, 2)
+    kinds = np.array([contact.kind for contact in contacts])
+    passes = np.array([contact.pass_index for contact in contacts])
+    for contact in contacts:
+        others = (kinds != contact.kind) & (passes != contact.pass_index)
+        away = np.hypot(*(places[others] - (contact.easting_m, contact.northing_m)).T)
+        if away.size and away.min() < max(_SAME_M, contact.half_size_m):
+            found.add(contact)
+    return found
+
+
+def _places(contacts: Sequence[Contact], crs: str) -> list[str]:
+    """Return latitude and longitude in words; empty on a local grid."""
+    if not contacts or is_local(crs):
+        return [""] * len(contacts)
+    east = np.array([contact.easting_m for contact in contacts])
+    north = np.array([contact.northing_m for contact in contacts])
+    lon, lat = transform(east, north, crs, GEOGRAPHIC)
+    return [f"{y:.6f}, {x:.6f}" for x, y in zip(lon, lat, strict=True)]
+
+
+def _short(crs: str) -> str:
+    return crs if len(crs) < 40 else "local metric grid"
+
+
+def _card(number: int, contact: Contact, place: str, disputed: bool) -> str:
+    picture = base64.b64encode(contact.snippet).decode("ascii")
+    what = "height" if contact.kind == "hill" else "depth"
+    least = "at least " if contact.lower_bound else ""
+    mark = '<b class="mark">disputed: another pass saw the other kind</b>' if disputed else ""
+    side = "starboard" if contact.across_m > 0 else "port"
+    rows = [
+        (what, f"{least}{contact.height_m:.2f} m &plusmn; {contact.sigma_m:.2f} m"),
+        ("position", f"{contact.easting_m:.2f} E, {contact.northing_m:.2f} N"),
+        ("latitude, longitude", place),
+        ("slant range", f"{contact.slant_range_m:.2f} m to {side}"),
+        ("shadow", f"{contact.shadow_length_m:.2f} m{', runs out of the swath' if least else ''}"),
+        ("pass, ping", f"{contact.pass_index}, {contact.ping}"),
+        ("probability", f"{contact.probability:.0%}"),
+    ]
+    lines = "".join(f"<dt>{name}</dt><dd>{value}</dd>" for name, value in rows if value)
+    return (
+        f'<article><img alt="echo of contact {number}" src="data:image/png;base64,{picture}">'
+        f"<div><h2>{number}. {contact.kind}</h2>{mark}<dl>{lines}</dl></div></article>"
+    )
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>Contacts: {title}</title>
+<style>
+body {{ font: 15px/1.4 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem;
+  color: #1c2733; background: #f5f6f7; }}
+main {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(30rem, 1fr)); gap: 1rem; }}
+article {{ display: flex; gap: 1rem; background: #fff; border: 1px solid #d8dde2; border-radius: 6px;
+  padding: .8rem; break-inside: avoid; }}
+img {{ width: 200px; height: 200px; object-fit: contain; image-rendering: pixelated; background: #20304a; }}
+h2 {{ margin: 0 0 .4rem; font-size: 1.05rem; }}
+dl {{ display: grid; grid-template-columns: auto 1fr; gap: .1rem .8rem; margin: 0; font-size: .88rem; }}
+dt {{ color: #5a6772; }} dd {{ margin: 0; font-variant-numeric: tabular-nums; }}
+.mark {{ display: block; color: #a02020; font-size: .85rem; margin-bottom: .3rem; }}
+</style></head><body>
+<h1>Contacts</h1>
+<p>{title}. {said} Positions in {crs}. Each picture has the track to the right and range upwards, to one scale
+on both axes: black is shadow, white a highlight. Heights are above the surrounding floor, with 1-sigma;
+the probability is that of an object against the floor's own relief.</p>
+<main>
+{cards}
+</main></body></html>
+"""

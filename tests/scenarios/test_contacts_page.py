@@ -1,0 +1,40 @@
+"""The contact report: self-contained, complete, and honest about what it cannot say."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from perception.strips import build_strip
+from scenarios.report.contacts import contacts_of, write_contacts
+from tests.perception.echo_fixtures import Survey, box, make_swath
+
+CRS = "EPSG:32619"
+
+
+def test_the_page_holds_every_contact_and_needs_no_network(tmp_path: Path) -> None:
+    swath = make_swath(
+        box(1.0, 15, 10, 0.8, 0.8), Survey(n_pings=80, n_samples=500), np.random.default_rng(5)
+    )
+    contacts = contacts_of(build_strip(swath))
+    assert len(contacts) == 1
+    least = replace(contacts[0], lower_bound=True, probability=0.5)
+    other = replace(contacts[0], kind="crater", pass_index=1)
+    write_contacts(tmp_path / "contacts.html", [*contacts, least, other], "survey.xtf", CRS)
+    page = (tmp_path / "contacts.html").read_text()
+    assert page.count("<article>") == 3 and "3 contacts: 2 hills, 1 craters" in page
+    assert f"{contacts[0].height_m:.2f} m &plusmn; {contacts[0].sigma_m:.2f} m" in page
+    assert page.count("at least") == 1 and page.count("disputed") == 3
+    pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert len(pictures) == 3 and base64.b64decode(pictures[0])[:8] == b"\x89PNG\r\n\x1a\n"
+    assert "http" not in page and "<script" not in page
+
+
+def test_no_contact_is_said_in_words(tmp_path: Path) -> None:
+    write_contacts(tmp_path / "contacts.html", [], "a <b>", CRS)
+    page = (tmp_path / "contacts.html").read_text()
+    assert "No contact stands out" in page and "a &lt;b&gt;" in page
