@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage, sparse
 
-from perception.posterior import Problem, Spectrum
+from perception.multigrid import Spectrum
+from perception.posterior import Problem
 from perception.rays import Soundings
 from perception.records import FloatArray
 from perception.roughness import first_returns, random_floor
@@ -129,5 +130,5 @@ def _solve_strip(
         albedo=Spectrum(1e6, 1e6, 1e6), mean_height=np.zeros(shape),
     )  # fmt: skip
     start = (np.zeros(shape), np.zeros(shape), np.zeros(1))
-    solution, _ = problem.solve(start, problem.right_side(), tolerance=1e-3, most=60)
+    solution, _ = problem.solve(start, problem.right_side())
     return solution[0]

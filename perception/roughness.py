@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import optimize, special
 
-from perception.posterior import Spectrum
+from perception.multigrid import Spectrum
 from perception.rays import Soundings
 from perception.records import FloatArray
 

@@ -8,6 +8,7 @@ Arrays: `z` and `a` are (rows, cols) nodes; features and moments are (k, rows - 
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 
@@ -50,14 +51,14 @@ def apply_data(moments, z, a, cell, out_z, out_a):
     rows, cols = z.shape
     for i in range(rows - 1):
         for j in range(cols - 1):
-            if moments[9, i, j] == 0.0:
+            if moments[i, j, 9] == 0.0:
                 continue
             sw, se, nw, ne = z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]
             f0 = (se + ne - sw - nw) / (2 * cell)
             f1 = (nw + ne - sw - se) / (2 * cell)
             f2 = 0.25 * (sw + se + nw + ne)
             f3 = 0.25 * (a[i, j] + a[i, j + 1] + a[i + 1, j] + a[i + 1, j + 1])
-            m = moments[:, i, j]
+            m = moments[i, j]
             e = (m[0] * f0 + m[1] * f1 + m[2] * f2 + m[3] * f3) / (2 * cell)
             n = (m[1] * f0 + m[4] * f1 + m[5] * f2 + m[6] * f3) / (2 * cell)
             c = 0.25 * (m[2] * f0 + m[5] * f1 + m[7] * f2 + m[8] * f3)
@@ -133,21 +134,21 @@ def gain_to_features(cell, value, c_east, c_north, c_level, out):
 
 @njit(cache=True, fastmath=True)
 def accumulate_moments(cell, weight, c_east, c_north, c_level, out):
-    """Add the rows to the cells' 4x4 matrices (10, duals)."""
+    """Add the rows to the cells' 4x4 matrices (duals, 10)."""
     for i in range(len(cell)):
         q = cell[i]
         w = weight[i]
         e, n, c = c_east[i], c_north[i], c_level[i]
-        out[0, q] += w * e * e
-        out[1, q] += w * e * n
-        out[2, q] += w * e * c
-        out[3, q] += w * e
-        out[4, q] += w * n * n
-        out[5, q] += w * n * c
-        out[6, q] += w * n
-        out[7, q] += w * c * c
-        out[8, q] += w * c
-        out[9, q] += w
+        out[q, 0] += w * e * e
+        out[q, 1] += w * e * n
+        out[q, 2] += w * e * c
+        out[q, 3] += w * e
+        out[q, 4] += w * n * n
+        out[q, 5] += w * n * c
+        out[q, 6] += w * n
+        out[q, 7] += w * c * c
+        out[q, 8] += w * c
+        out[q, 9] += w
 
 
 @njit(cache=True, fastmath=True)
@@ -157,3 +158,119 @@ def gain_normal(knot, share, weight, out):
         for k in range(knot.shape[1]):
             for q in range(knot.shape[1]):
                 out[knot[i, k], knot[i, q]] += weight[i] * share[i, k] * share[i, q]
+
+
+@njit(cache=True)
+def couple_gain(cell, weight, c_east, c_north, c_level, knot, share, cols, cell_m, depth, out):
+    """Add to `out` (2, rows, cols, knots) what ties nodes of a grid 2^depth wider to the gains."""
+    step = 1 << depth
+    for i in range(len(cell)):
+        r = cell[i] // cols
+        c = cell[i] % cols
+        y = ((r % step) + 0.5) / step
+        x = ((c % step) + 0.5) / step
+        for k in range(4):
+            up = k // 2
+            right = k % 2
+            fy = y if up else 1 - y
+            fx = x if right else 1 - x
+            z = (c_east[i] * (fy if right else -fy) + c_north[i] * (fx if up else -fx)) / (
+                step * cell_m
+            ) + c_level[i] * fx * fy
+            for m in range(knot.shape[1]):
+                v = weight[i] * share[i, m]
+                out[0, r // step + up, c // step + right, knot[i, m]] += v * z
+                out[1, r // step + up, c // step + right, knot[i, m]] += v * fx * fy
+
+
+@njit(cache=True, fastmath=True)
+def apply_local(local, z, a, out_z, out_a):
+    """Add the cells' own matrices on their corners' (z, a), packed (36, r, c), applied to the fields."""
+    rows, cols = z.shape
+    u = np.empty(8)
+    v = np.empty(8)
+    for i in range(rows - 1):
+        for j in range(cols - 1):
+            u[0], u[1], u[2], u[3] = z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]
+            u[4], u[5], u[6], u[7] = a[i, j], a[i, j + 1], a[i + 1, j], a[i + 1, j + 1]
+            v[:] = 0.0
+            k = 0
+            for p in range(8):
+                v[p] += local[i, j, k] * u[p]
+                k += 1
+                for q in range(p + 1, 8):
+                    m = local[i, j, k]
+                    v[p] += m * u[q]
+                    v[q] += m * u[p]
+                    k += 1
+            out_z[i, j] += v[0]
+            out_z[i, j + 1] += v[1]
+            out_z[i + 1, j] += v[2]
+            out_z[i + 1, j + 1] += v[3]
+            out_a[i, j] += v[4]
+            out_a[i, j + 1] += v[5]
+            out_a[i + 1, j] += v[6]
+            out_a[i + 1, j + 1] += v[7]
+
+
+@njit(cache=True)
+def local_of_moments(moments, cell):
+    """Return the cells' matrices on their corners (r, c, 36) from those on features (r, c, 10)."""
+    rows, cols = moments.shape[0], moments.shape[1]
+    feature = np.zeros((4, 8))
+    for k in range(4):
+        feature[0, k] = (1.0 if k % 2 else -1.0) / (2 * cell)
+        feature[1, k] = (1.0 if k // 2 else -1.0) / (2 * cell)
+        feature[2, k] = 0.25
+        feature[3, 4 + k] = 0.25
+    out = np.zeros((rows, cols, 36))
+    full = np.empty((4, 4))
+    for i in range(rows):
+        for j in range(cols):
+            if moments[i, j, 9] == 0.0:
+                continue
+            k = 0
+            for p in range(4):
+                for q in range(p, 4):
+                    full[p, q] = full[q, p] = moments[i, j, k]
+                    k += 1
+            pack(feature.T @ full @ feature, out[i, j])
+    return out
+
+
+@njit(cache=True)
+def pack(matrix, out):
+    """Add the upper triangle of an 8 x 8 matrix to `out` (36,)."""
+    k = 0
+    for p in range(8):
+        for q in range(p, 8):
+            out[k] += matrix[p, q]
+            k += 1
+
+
+@njit(cache=True)
+def coarsen_local(fine):
+    """Return the matrices of cells twice as wide (r / 2, c / 2, 36): exact for bilinear fields."""
+    rows, cols = fine.shape[0] // 2, fine.shape[1] // 2
+    # Corner values of each child by those of its parent.
+    line = np.array([[[1.0, 0.0], [0.5, 0.5]], [[0.5, 0.5], [0.0, 1.0]]])
+    child = np.zeros((4, 8, 8))
+    for di in range(2):
+        for dj in range(2):
+            for p in range(4):
+                for q in range(4):
+                    v = line[di, p // 2, q // 2] * line[dj, p % 2, q % 2]
+                    child[2 * di + dj, p, q] = v
+                    child[2 * di + dj, 4 + p, 4 + q] = v
+    out = np.zeros((rows, cols, 36))
+    full = np.empty((8, 8))
+    for i in range(2 * rows):
+        for j in range(2 * cols):
+            k = 0
+            for p in range(8):
+                for q in range(p, 8):
+                    full[p, q] = full[q, p] = fine[i, j, k]
+                    k += 1
+            c = child[2 * (i % 2) + j % 2]
+            pack(c.T @ full @ c, out[i // 2, j // 2])
+    return out

@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 from scipy import sparse
 
 from perception.gain_basis import GainBasis
-from perception.posterior import Problem, Spectrum, prolong, restrict
+from perception.multigrid import Spectrum, prolong, restrict
+from perception.posterior import Problem
 from perception.rays import Soundings
 from perception.roughness import fit_spectrum, learn_roughness, random_floor, structure_function
 from perception.soundings import bilinear_rows, sounding_equations
@@ -66,7 +67,7 @@ def test_solver_finds_the_dense_solution() -> None:
     problem = small_problem(np.random.default_rng(2))
     right = problem.right_side()
     start = (np.zeros(problem.shape), np.zeros(problem.shape), np.zeros(5))
-    (z, a, g), steps = problem.solve(start, right, tolerance=1e-9, most=200)
+    (z, a, g), steps = problem.solve(start, right, tolerance=1e-6, most=200)
     expected = np.linalg.solve(
         dense(problem), np.concatenate([right[0].ravel(), right[1].ravel(), right[2]])
     )
@@ -81,7 +82,7 @@ def test_perturbations_spread_as_the_posterior_does() -> None:
     problem = small_problem(rng)
     start = (np.zeros(problem.shape), np.zeros(problem.shape), np.zeros(5))
     draws = [
-        problem.solve(start, problem.perturbation(rng), tolerance=1e-5, most=80)[0][0]
+        problem.solve(start, problem.perturbation(rng), tolerance=1e-3, most=80)[0][0]
         for _ in range(40)
     ]
     nodes = problem.shape[0] * problem.shape[1]

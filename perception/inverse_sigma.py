@@ -1,0 +1,60 @@
+"""Sigma of the joint surface: the spread of perturbed solutions, and how far the surface may be believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+
+from perception.inverse_state import Solved, State, linear_problem
+from perception.posterior import Problem
+from perception.records import FloatArray
+from perception.soundings import sounding_equations
+
+
+def spread(state: State, solved: Solved, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Return the 1-sigma of the heights, jointly and from the soundings alone, by perturbation."""
+    weight = solved.data.weight * state.config.independent
+    joint = linear_problem(state, replace(solved.data, weight=weight), solved.equations)
+    alone = linear_problem(
+        state,
+        None,
+        sounding_equations(
+            state.surface,
+            state.west_m,
+            state.south_m,
+            state.cell_m,
+            state.soundings,
+            lead_m=state.lead_m,
+            lead_sigma_m=state.lead_sigma_m,
+        ),
+    )
+    return _sample_sigma(joint, state, rng), _sample_sigma(alone, state, rng)
+
+
+def _sample_sigma(problem: Problem, state: State, rng: np.random.Generator) -> FloatArray:
+    total = np.zeros(state.shape)
+    # A perturbation moves every unknown by about a sigma: a tenth of that, over all, is near enough.
+    tolerance = 0.1 * float(np.sqrt(2 * total.size))
+    for _ in range(state.config.samples):
+        zero = (np.zeros(state.shape), np.zeros(state.shape), np.zeros(state.basis.size))
+        solution, _ = problem.solve(zero, problem.perturbation(rng), tolerance)
+        total += solution[0] ** 2
+    # Few samples: neighbours lend theirs, the spread varies slowly.
+    return np.sqrt(ndimage.uniform_filter(total / state.config.samples, 7, mode="nearest"))
+
+
+def honest_sigma(state: State, joint: FloatArray, alone: FloatArray) -> FloatArray:
+    """Return the sigma of the map, and hold the map to what the soundings allow.
+
+    A height further from the soundings' surface than four of its sigmas is no finding but a failure
+    of the model: it is drawn back, and its sigma is that of the soundings.
+    """
+    base = state.surface if state.base is None else state.base
+    limit = 4 * alone
+    beyond = np.abs(state.surface - base) > limit
+    state.surface = np.clip(state.surface, base - limit, base + limit)
+    # The lead of the first returns shifts the whole map; it is known to about a half.
+    sigma = np.sqrt(joint**2 + (0.5 * float(np.mean(state.lead_m))) ** 2)
+    return np.where(beyond, np.maximum(sigma, alone), sigma)

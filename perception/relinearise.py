@@ -1,0 +1,222 @@
+"""The steps of the joint inversion: trace the present surface, compare, solve, trace again."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from perception.first_return import first_return_lead
+from perception.inverse_state import Data, Solved, State, linear_problem, sounding_surface
+from perception.multigrid import Spectrum
+from perception.occlusion import dark_samples, shadow_equations
+from perception.profiles import mean_profiles, one_sided
+from perception.rays import Rays
+from perception.records import BoolArray, FloatArray, Progress
+from perception.shading import Rows, trace
+from perception.soundings import Equations, both, mean_soundings, sounding_equations
+from perception.stencils import dual_features
+
+logger = logging.getLogger(__name__)
+
+# Where looks from both sides cover some of the ground they settle the gain, and holding the rest to
+# profiles that soundings only extrapolate would spoil it.
+_MOSTLY_ONE_SIDED = 0.85
+
+
+# Part of the ground below a track that other passes' echoes resolve as well as their noise allows: crests hide
+# what lies behind them, and what is hidden keeps the lead of ground unseen.
+_RESOLVED = 0.5
+# Looks from one side rest on a gain that their own ground cannot correct; so much they count.
+_ONE_SIDED_PART = 0.1
+
+
+def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generator) -> Solved:
+    """Relinearise and solve until the surface stands still."""
+    for k in range(len(state.step_m), len(state.step_m) + steps):
+        dark = _dark(state, first=k == 0)
+        rows, passed = trace(
+            state.surface, state.west_m, state.south_m, state.cell_m, state.rays,
+            state.config.exponent, dark,
+        )  # fmt: skip
+        if state.lead_sigma_m == 0.0:
+            _learn_lead(state, rows, rng)
+        data = _linearise(state, rows, first=k == 0)
+        equations = sounding_equations(
+            state.surface,
+            state.west_m,
+            state.south_m,
+            state.cell_m,
+            state.soundings,
+            lead_m=state.lead_m,
+            lead_sigma_m=state.lead_sigma_m,
+        )
+        equations = both(equations, mean_soundings(equations, state.soundings))
+        single = one_sided(rows, state.shape)
+        held = _held_profiles(state, single, passed)
+        if k > 0 and state.config.shadows:
+            equations = both(
+                equations,
+                shadow_equations(
+                    state.surface, state.west_m, state.south_m, state.cell_m, state.rays, dark
+                ),
+            )
+        solved = Solved(_less_of_one_sided(data, single), equations, single, passed)
+        alone = _mostly(single, passed)
+        if k > 0 and not alone:
+            data = solved.data
+        caution = state.config.caution if k > 0 and alone else 0.0
+        problem = linear_problem(state, data, both(equations, held), caution)
+        fields = (state.surface, state.albedo, state.gain)
+        solution, used = problem.solve(fields, problem.right_side())
+        seen = np.zeros(state.shape, bool)
+        seen[:-1, :-1] = passed & ~single if np.any(passed & ~single) else passed
+        step = float(np.sqrt(np.mean((solution[0] - state.surface)[seen] ** 2)))
+        state.surface, state.albedo, state.gain = solution
+        state.step_m.append(step)
+        logger.info(
+            "joint inversion: iteration %d, %d data, residual %.3f, step %.3f m, %d solver steps",
+            k + 1, len(rows.cell), state.residual[-1], step, used,
+        )  # fmt: skip
+        progress("joint inversion", k + 2, state.config.iterations + 3)
+        if step < 0.02:
+            break
+    return solved
+
+
+def _dark(state: State, first: bool) -> list[BoolArray]:
+    """Return the samples of all rays that lie in shadow; none before the gain is known."""
+    if first or not state.config.shadows:
+        return [np.zeros(ray.power.shape, np.bool_) for ray in state.rays]
+    level = float(np.median(state.soundings.up_m - state.soundings.range_m))
+    return [
+        dark_samples(ray, np.full(len(ray.up_m), level), state.basis, state.gain, state.cell_m)
+        for ray in state.rays
+    ]
+
+
+def _mostly(single: BoolArray, lit: BoolArray) -> bool:
+    return float(np.sum(single)) >= _MOSTLY_ONE_SIDED * float(np.sum(lit))
+
+
+def _less_of_one_sided(data: Data, single: BoolArray) -> Data:
+    """Return the data with those of one-sided ground weighing less.
+
+    A slope and a gain explain one look alike. Where looks from both sides settle the gain, what is left of its
+    error tilts the ground outside them, by metres at the rim; the pull of that ground then spoils the gain.
+    """
+    part = np.where(single.ravel()[data.rows.cell], _ONE_SIDED_PART, 1.0)
+    return replace(data, weight=data.weight * part)
+
+
+def _held_profiles(state: State, single: BoolArray, lit: BoolArray) -> Equations:
+    """Return the mean profiles that one-sided looks must not change."""
+    if state.base is None:
+        # Once the first returns' lead is known: the surface of the soundings alone.
+        state.base = sounding_surface(state)
+    bottom = state.soundings
+    spread = float(np.std(bottom.up_m - bottom.range_m))
+    frame = (state.base, state.west_m, state.south_m, state.cell_m, state.rays)
+    if _mostly(single, lit):
+        return mean_profiles(*frame, single, max(0.1 * spread, 0.02))
+    # Means over a line of independent stretches: the longer the line, the less may its profile rise.
+    length = float(np.median([_length(ray) for ray in state.rays]))
+    stretches = max(length / (2 * _correlation_length(state.roughness, length)), 1.0)
+    return mean_profiles(*frame, lit & ~single, spread / np.sqrt(stretches), relative=True)
+
+
+def _length(ray: Rays) -> float:
+    return float(np.hypot(np.ptp(ray.easting_m), np.ptp(ray.northing_m)))
+
+
+def _correlation_length(roughness: Spectrum, longest_m: float) -> float:
+    """Return the mean inverse wave number of the heights' variance, of waves that fit a line, metres."""
+    k = np.geomspace(2 * np.pi / longest_m, 10, 400)
+    power = k / (roughness.p0 + roughness.p1 * k**2 + roughness.p2 * k**4)
+    return float(np.trapezoid(power / k, k) / np.trapezoid(power, k))
+
+
+def _learn_lead(state: State, rows: Rows, rng: np.random.Generator) -> None:
+    """Find by how much first returns lead; less where other passes resolve the floor below a track."""
+    bottom, config = state.soundings, state.config
+    col = np.clip((bottom.easting_m - state.west_m) / state.cell_m, 0, state.shape[1] - 2)
+    row = np.clip((bottom.northing_m - state.south_m) / state.cell_m, 0, state.shape[0] - 2)
+    below = np.unique(row.astype(np.int64) * (state.shape[1] - 1) + col.astype(np.int64))
+    duals = (state.shape[0] - 1) * (state.shape[1] - 1)
+    far = np.bincount(rows.cell[rows.ground_m > rows.drop_m], minlength=duals)
+    # Two looks tell slope from albedo.
+    seen = _RESOLVED * float(np.mean(np.minimum(far[below], 2))) / 2
+    altitude = float(np.median(bottom.range_m))
+    lead = spread = 0.0
+    for part, resolved in ((seen, True), (1 - seen, False)):
+        if part > 0.02:
+            mean, sigma = first_return_lead(
+                state.roughness, altitude, config.nadir * altitude,
+                float(np.median(bottom.sigma_m)), state.cell_m, resolved, rng,
+            )  # fmt: skip
+            lead, spread = lead + part * mean, sigma
+    state.lead_m, state.lead_sigma_m = lead, spread
+    logger.info(
+        "first returns lead by %.3f +- %.3f m, %.0f %% seen by other passes",
+        lead,
+        spread,
+        100 * seen,
+    )
+
+
+def _linearise(state: State, rows: Rows, first: bool) -> Data:
+    """Return the data rows about the present surface, robustly weighted."""
+    config = state.config
+    knot, share = state.basis.place(rows.angle_rad, rows.slant_m, rows.side.astype(np.int64))
+    if first:
+        state.gain = state.basis.start(rows.ratio, knot)
+    present = np.empty((4, state.shape[0] - 1, state.shape[1] - 1))
+    dual_features(state.surface, state.albedo, state.cell_m, present)
+    at = present.reshape(4, -1)[:, rows.cell]
+    gain = np.einsum("ij,ij->i", share, state.gain[knot])
+    residual = rows.ratio - gain - at[3]
+    scale = _scale_by_angle(residual, rows.angle_rad)
+    # Residuals of the first pass are the relief itself: there the width is given, not measured.
+    sigma = np.full(len(residual), 0.35) if first else np.maximum(scale, config.least_sigma)
+    unit = residual if first else residual / (2.5 * np.maximum(scale, 0.1))
+    weight = rows.share**2 / (1 + unit**2) / sigma**2
+    weight[rows.ground_m < config.nadir * rows.drop_m] = 0.0
+    lever = np.maximum(rows.ground_m - rows.drop_m * rows.slope, 0.3 * rows.ground_m)
+    slope = 0.0 if first else state.basis.angle_slope(state.gain, knot)
+    c_level = rows.c_level + slope * rows.share / lever
+    value = (
+        _linear_residual(rows, residual, config.exponent) + gain + at[3]
+        + rows.c_east * at[0] + rows.c_north * at[1] + c_level * at[2]
+    )  # fmt: skip
+    state.residual.append(float(np.sqrt(np.average(residual**2, weights=weight))))
+    return Data(rows, weight, c_level, value, knot, share)
+
+
+def _linear_residual(rows: Rows, residual: FloatArray, exponent: float) -> FloatArray:
+    """Return the residual that a linear step needs to land on the slope that explains it.
+
+    The log power bends strongly with slope where grazing; the law is inverted for the slope, and the
+    change of slope is multiplied by the derivative: a Newton step that does not overshoot.
+    """
+    tangent = (rows.drop_m + rows.ground_m * rows.slope) / (
+        rows.ground_m - rows.drop_m * rows.slope
+    )
+    tangent = np.maximum(tangent, 0.02)
+    power = tangent**2 / np.sqrt(1 + tangent**2) * np.exp(np.clip(residual, -6, 3))
+    wanted = np.sqrt((power**2 + np.sqrt(power**4 + 4 * power**2)) / 2)
+    slope = (wanted * rows.ground_m - rows.drop_m) / (rows.ground_m + wanted * rows.drop_m)
+    change = np.clip(slope - rows.slope, -0.6, 0.6)
+    return np.hypot(rows.c_east, rows.c_north) * change
+
+
+def _scale_by_angle(residual: FloatArray, angle_rad: FloatArray) -> FloatArray:
+    """Return the robust 1-sigma of the residuals in bins of 5 degrees of angle."""
+    bins = np.clip((np.degrees(angle_rad) / 5).astype(np.int64), 0, 20)
+    scale = np.ones(len(residual))
+    for b in np.unique(bins):
+        chosen = bins == b
+        if chosen.sum() > 20:
+            spread = residual[chosen]
+            scale[chosen] = 1.4826 * np.median(np.abs(spread - np.median(spread)))
+    return np.maximum(scale, 1e-3)
