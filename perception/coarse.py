@@ -60,7 +60,7 @@ class CoarseSolver:
         fine = hierarchy.levels[0]
         couple_gain(*rows, knot, share, fine.shape[1] - 1, fine.cell_m, depth, coupling)
         border = coupling.reshape(-1, len(gain_block))
-        factor = linalg.splu(_matrix(level).tocsc(), options={"SymmetricMode": True},
+        factor = linalg.splu(level_matrix(level).tocsc(), options={"SymmetricMode": True},
                              diag_pivot_thresh=0.0, permc_spec="MMD_AT_PLUS_A")  # fmt: skip
         answer = factor.solve(border)
         return cls(depth, level.shape, factor, border, answer,
@@ -82,7 +82,8 @@ class CoarseSolver:
         return z, a, gain
 
 
-def _matrix(level: Level) -> sparse.csr_matrix:
+def level_matrix(level: Level) -> sparse.csr_matrix:
+    """Return the operator of a level on (heights, albedo) as a matrix."""
     rows, cols = level.shape
     nodes = np.arange(rows * cols).reshape(rows, cols)
     corners = np.stack([nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]], axis=-1)

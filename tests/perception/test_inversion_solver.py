@@ -6,6 +6,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy import sparse
 
+from perception.coarse import level_matrix
 from perception.gain_basis import GainBasis
 from perception.multigrid import Spectrum, prolong, restrict
 from perception.posterior import Problem
@@ -176,3 +177,77 @@ def test_gain_knots_share_one_and_curves_keep_shape() -> None:
     gain[:36] = 0.1
     assert gain @ basis.precision() @ gain < 0.01 * bent
     assert sparse.issparse(bilinear_rows(angle, angle, angle, (4, 4)))
+
+
+def crossed_problem(rng: np.random.Generator) -> Problem:
+    """Return slopes seen from both axes, firmly, over a rough floor, with soundings along two lines."""
+    shape, cells = (33, 49), 32 * 48
+    cell = np.concatenate([np.arange(cells)] * 4)
+    n = len(cell)
+    across = np.repeat([1.0, -1.0, 0.0, 0.0], cells)
+    along = np.repeat([0.0, 0.0, 1.0, -1.0], cells)
+    sense = rng.uniform(4, 40, n)
+    angle = rng.uniform(0, 5.9, n)
+    knot = np.stack([angle.astype(np.int64), angle.astype(np.int64) + 1], axis=1)
+    line = np.arange(1.0, 31.0)
+    return Problem(
+        cell_m=1.0, shape=shape, cell=cell, weight=rng.uniform(1, 25, n), c_east=sense * across,
+        c_north=sense * along, c_level=np.zeros(n), value=rng.normal(0, 1, n), knot=knot,
+        share=np.stack([1 - angle % 1, angle % 1], axis=1), gain_precision=np.eye(7),
+        rows=bilinear_rows(np.tile(line, 2), np.repeat([8.0, 40.0], 30), np.ones(60), shape),
+        row_weight=np.full(60, 400.0), row_value=rng.normal(0, 1, 60),
+        height=Spectrum(1e-4, 0.27, 3.0), albedo=Spectrum(0.04, 1.3, 10.0),
+        mean_height=np.zeros(shape),
+    )  # fmt: skip
+
+
+def test_no_smoother_is_built_on_too_small_an_eigenvalue() -> None:
+    """Too small a bound once made the preconditioner indefinite, and an inversion end at its first step."""
+    problem = crossed_problem(np.random.default_rng(7))
+    for level in problem.hierarchy.levels:
+        z = np.random.default_rng(8).standard_normal(level.shape)
+        a = z[::-1].copy()
+        value = 0.0
+        for _ in range(200):
+            y_z, y_a = level.apply(z, a)
+            y_z, y_a = y_z / level.diagonal[0], y_a / level.diagonal[1]
+            value = float(np.sqrt(np.vdot(y_z, y_z) + np.vdot(y_a, y_a)))
+            z, a = y_z / value, y_a / value
+        # A Chebyshev polynomial stays a contraction a sixth beyond its range.
+        assert value < 1.1 * level.largest
+
+
+def test_few_steps_solve_firm_slopes_seen_along_both_axes() -> None:
+    problem = crossed_problem(np.random.default_rng(9))
+    start = (np.zeros(problem.shape), np.zeros(problem.shape), np.zeros(7))
+    right = problem.right_side()
+    near, steps = problem.solve(start, right)
+    exact, _ = problem.solve(near, right, tolerance=1e-7, most=300)
+    assert steps < 40
+    # Half a posterior sigma in all is next to nothing at any one node.
+    assert np.abs(near[0] - exact[0]).max() < 0.02
+
+
+def test_a_coarser_grid_has_the_energy_of_the_field_it_stands_for() -> None:
+    problem = crossed_problem(np.random.default_rng(10))
+    fine, coarse = problem.hierarchy.levels[0].data, problem.hierarchy.levels[1].data
+    rng = np.random.default_rng(11)
+    shape = (coarse.shape[0] + 1, coarse.shape[1] + 1)
+    z, a = rng.normal(size=shape), rng.normal(size=shape)
+    energy = []
+    for data, u, v in ((coarse, z, a), (fine, prolong(z), prolong(a))):
+        out_z, out_a = np.zeros_like(u), np.zeros_like(u)
+        data.add(u, v, out_z, out_a)
+        energy.append(np.vdot(u, out_z) + np.vdot(v, out_a))
+    assert_allclose(energy[0], energy[1], rtol=1e-12)
+
+
+def test_the_coarse_matrix_is_the_operator_of_its_level() -> None:
+    problem = crossed_problem(np.random.default_rng(12))
+    level = problem.hierarchy.levels[1]
+    rng = np.random.default_rng(13)
+    z, a = rng.normal(size=level.shape), rng.normal(size=level.shape)
+    found = level_matrix(level) @ np.concatenate([z.ravel(), a.ravel()])
+    assert_allclose(
+        found, np.concatenate([part.ravel() for part in level.apply(z, a)]), rtol=1e-9, atol=1e-9
+    )
