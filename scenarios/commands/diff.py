@@ -1,4 +1,4 @@
-"""`bathynav diff A.tif B.tif --out DIR`: how two maps differ."""
+"""`bathynav diff A B --out DIR`: how two maps differ, or the contacts of two surveys."""
 
 from __future__ import annotations
 
@@ -26,18 +26,62 @@ from scenarios.commands.console import (
     show_default=True,
     help="Combined sigmas beyond which a patch of cells counts as changed.",
 )
+@click.option(
+    "--position-sigma",
+    type=click.FloatRange(min=0),
+    default=1.0,
+    show_default=True,
+    help="1-sigma of either survey's track, m (contacts of folders).",
+)
 @common_options
 def command(
-    first: Path, second: Path, out: Path, beyond: float, quiet: bool, verbose: bool
+    first: Path,
+    second: Path,
+    out: Path,
+    beyond: float,
+    position_sigma: float,
+    quiet: bool,
+    verbose: bool,
 ) -> None:
-    """Tell how map SECOND differs from map FIRST, on the cells of FIRST.
+    """Tell how SECOND differs from FIRST: two maps, or two output folders of strips or map.
 
-    Writes difference.tif (second minus first, with the combined sigma), changes.gpkg (the places that
-    changed), difference.png and metrics.json. The maps must share their coordinate system.
+    Of maps, on the cells of FIRST: difference.tif (second minus first, with the combined sigma),
+    changes.gpkg (the places that changed), difference.png and metrics.json. Of folders that hold an
+    objects.csv: contact-changes.csv and .gpkg, the contacts that appeared, vanished or changed height.
+    Both must share their coordinate system.
 
-    Example: bathynav diff before/map.tif after/map.tif --out changes
+    \b
+    bathynav diff before/map.tif after/map.tif --out changes
+    bathynav diff strips-may strips-june --out changes
     """
     set_verbosity(quiet, verbose)
+    if first.is_dir() and second.is_dir():
+        _contacts(first, second, out, position_sigma, beyond, quiet)
+    else:
+        _maps(first, second, out, beyond, quiet)
+
+
+def _contacts(
+    first: Path, second: Path, out: Path, position_sigma: float, beyond: float, quiet: bool
+) -> None:
+    from scenarios.contact_folders import compare_folders
+    from scenarios.outputs import write_metrics
+
+    prepare_out(out)
+    metrics = compare_folders(first, second, out, position_sigma, beyond)
+    config = {
+        "first": str(first), "second": str(second), "beyond_sigma": beyond,
+        "position_sigma_m": position_sigma,
+    }  # fmt: skip
+    write_metrics(out, metrics, config)
+    if not quiet:
+        rows = [(name.removeprefix("contacts_").replace("_", " "), str(number))
+                for name, number in metrics.items()]  # fmt: skip
+        print_table(f"contacts of {second} against {first}", rows)
+        click.echo(f"written to {out}")
+
+
+def _maps(first: Path, second: Path, out: Path, beyond: float, quiet: bool) -> None:
     from mapping.compare import difference, write_changes
     from mapping.rasters import read_map, write_bands
     from scenarios.outputs import write_metrics
