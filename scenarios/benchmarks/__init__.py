@@ -11,6 +11,10 @@ from dataclasses import dataclass, field
 # name -> (module below scenarios.benchmarks, what it measures)
 BENCHMARKS: dict[str, tuple[str, str]] = {
     "inversion": ("inversion", "joint inversion beside interpolated soundings: error, sigma, time"),
+    "inversion-terrains": (
+        "inversion_terrains",
+        "joint inversion over ten terrains kept apart: error, sigma; a large map's time and memory",
+    ),
     "experiments": ("experiments", "the experiment runner: overhead, memory, sameness"),
     "sonar-files": ("sonar_files", "reading sonar files: pings a second, memory at 1x and 10x"),
     "echoes": ("echoes", "echoes to strips: pings a minute, heights of objects against truth"),

@@ -53,7 +53,7 @@ def _case(geometry: str, terrain: str) -> list[Row]:
     start = time.perf_counter()
     grid = invert(looks, 1.0).grid
     seconds = time.perf_counter() - start
-    error, sigma, soundings = _errors(grid, simulation, looks)
+    error, sigma, soundings = errors(grid, simulation, looks)
     joint, alone = float(np.mean(np.abs(error))), float(np.mean(np.abs(soundings)))
     goal_m, goal_ratio = _GOALS[geometry]
     case = f"{geometry}, {terrain}"
@@ -118,7 +118,7 @@ def looks_of(simulation: Simulation) -> list[Look]:
     return looks
 
 
-def _errors(
+def errors(
     grid: Grid, simulation: Simulation, looks: list[Look]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the map's error, its sigma, and the error of interpolated soundings, between the lines."""
