@@ -185,3 +185,31 @@ def test_a_cell_that_is_no_length_is_wrong_usage(
 ) -> None:
     outcome = run_command(capsys, "map", made.survey, "--out", tmp_path / "o", f"--cell={cell}")
     assert outcome.status == 2 and "--cell" in outcome.err
+
+
+def test_maps_too_large_for_one_piece_are_made_in_tiles_unasked(
+    made: Made, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from perception.readers import open_survey
+    from perception.records import InputError
+    from scenarios.commands.map_command import _choose, _Tiling
+    from scenarios.survey_tiles import MOST_CELLS_AT_ONCE, MOST_JOINT_CELLS, expected_cells
+
+    survey = open_survey([made.survey])
+    no, yes = _Tiling(False, 1024, None, None), _Tiling(True, 1024, None, None)
+    grid = read_map(made.whole / "map.tif")
+    # Headers tell the size before any echo is read: the map's own within the reach of the swath.
+    assert 1.0 <= expected_cells(survey, 0.5) / grid.elevation_m.size < 3.0
+    assert _choose(survey, None, None, no, True) == ("joint", False)
+    assert _choose(survey, 0.5, "shadow", no, True) == ("shadow", False)
+    assert _choose(survey, 0.5, None, yes, True) == ("shadow", True)
+    joint_m, whole_m = (
+        0.5 * (expected_cells(survey, 0.5) / n) ** 0.5
+        for n in (MOST_JOINT_CELLS, MOST_CELLS_AT_ONCE)
+    )
+    assert _choose(survey, 0.99 * joint_m, None, no, False) == ("shadow", True)
+    assert "million cells: made in tiles" in capsys.readouterr().err
+    assert _choose(survey, 0.99 * joint_m, "joint", no, True) == ("joint", False)
+    assert _choose(survey, 0.99 * whole_m, "shadow", no, True) == ("shadow", True)
+    with pytest.raises(InputError, match="joint method knows none"):
+        _choose(survey, 0.99 * whole_m, "joint", no, True)
