@@ -15,7 +15,7 @@ best is accepted when it beats chance over all places tried, and the second by a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -30,6 +30,8 @@ _SCALE_CELLS = 4.0
 _KINDS = tuple(REGION_CLASSES.index(name) for name in ("peak", "pit"))
 # A landmark nearer to the border of the data than this many smoothing scales may be cut by it.
 _BORDER_SCALES = 1.0
+# Part of a landmark's region that must have been sounded, not filled.
+_LEAST_SOUNDED = 0.7
 # 1-sigma of a landmark's place, in smoothing scales, and of the logarithms of strength and size; from
 # landmarks of noisy patches against the map's own (docs/terrain-navigation.md).
 _PLACE_SCALES, _STRENGTH_SIGMA, _SIZE_SIGMA = 0.35, 0.35, 0.5
@@ -44,8 +46,9 @@ _TURN_BIN_RAD, _SHIFT_BIN_SCALES = float(np.radians(6.0)), 1.5
 # Places verified, and hypotheses kept.
 _VERIFIED, _KEPT = 60, 6
 # Log likelihood ratio of the best place to the next that proves it, and of the best to chance beyond
-# the logarithm of the number of places that could be told apart.
-_DISTINCT, _CHANCE = 6.0, 5.0
+# the logarithm of the number of places that could be told apart. Hills keep their distance from one
+# another, so chance matches more of them than of points strewn at random: a margin beyond e^5 for it.
+_DISTINCT, _CHANCE = 8.0, 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,15 +118,31 @@ def find_landmarks(grid: Grid, scale_m: float | None = None) -> Landmarks:
     """
     scale = _SCALE_CELLS * max(grid.cell_m, grid.cell_north_m) if scale_m is None else scale_m
     config = RegionConfig(scale_m=scale, k_sigma=0.0, seed_probability=0.0, keep_probability=False)
-    return landmarks_of(segment(grid, config).regions, scale)
+    known = np.isfinite(grid.elevation_m)
+    filled = replace(grid, elevation_m=_filled(grid, known, scale))
+    return landmarks_of(segment(filled, config).regions, scale, known)
 
 
-def landmarks_of(regions: RegionMap, scale_m: float) -> Landmarks:
+def _filled(grid: Grid, known: BoolArray, scale_m: float) -> FloatArray:
+    """Fill holes smoothly: a shadow across a hill must not cut it in two."""
+    if known.all() or not known.any():
+        return grid.elevation_m
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    rough = grid.elevation_m[tuple(nearest)]
+    width = (scale_m / grid.cell_north_m, scale_m / grid.cell_m)
+    weight = ndimage.gaussian_filter(known.astype(float), width)
+    level = ndimage.gaussian_filter(np.where(known, rough, 0.0), width)
+    # Far inside a wide hole nothing weighs anything: the nearest height will do, it is not used.
+    return np.where(known, rough, np.where(weight > 1e-3, level / np.maximum(weight, 1e-3), rough))
+
+
+def landmarks_of(regions: RegionMap, scale_m: float, sounded: BoolArray | None = None) -> Landmarks:
     """Take the peaks and pits of a region map that lie clear of holes and borders.
 
     Parameters
     ----------
     scale_m : smoothing that the regions were made with.
+    sounded : (rows, cols) cells that had a height before holes were filled; None all.
     """
     known = np.pad(regions.region > 0, 1)
     cell_north = regions.cell_m if regions.cell_height_m is None else regions.cell_height_m
@@ -140,6 +159,9 @@ def landmarks_of(regions: RegionMap, scale_m: float) -> Landmarks:
     inside = depth[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)]
     cut = 1.5 * max(regions.cell_m, cell_north)
     use = np.isin(kind, _KINDS) & (np.asarray(inner) > cut) & (inside > _BORDER_SCALES * scale_m)
+    if sounded is not None:
+        share = ndimage.mean(sounded, regions.region, np.arange(1, len(kind) + 1))
+        use &= np.asarray(share) > _LEAST_SOUNDED
     return Landmarks(
         easting_m=east[use],
         northing_m=north[use],
