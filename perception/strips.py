@@ -207,7 +207,8 @@ def _depth(swath: Swath) -> FloatArray:
     depth = np.asarray(swath.depth_m, float)
     known = np.isfinite(depth)
     if not known.any() or np.all(depth[known] == 0):
-        logger.warning(
+        # The survey warns once for all its passes.
+        logger.info(
             "%s: pass %d has no depth of the sonar; elevations are relative to the sonar",
             swath.source or "swath", swath.pass_index,
         )  # fmt: skip

@@ -18,6 +18,7 @@ from perception.geodesy import (
     wrap,
 )
 from perception.passes import PassConfig, Track, split_passes
+from perception.readers.compass import compass_warning, heading_offsets
 from perception.readers.raw import PingFlag, RawFile, plural
 from perception.readers.repair import mend_clock, mend_headings, mend_positions
 from perception.records import BoolArray, FloatArray, InputError, IntArray, Swath
@@ -125,6 +126,13 @@ class Survey:
                 "depth is unknown or zero throughout: elevations are relative to the sonar"
             )
         table, n_passes = _split(table, files, config or PassConfig())
+        if not any("off the track" in text for text in defects):
+            odd = compass_warning(
+                *heading_offsets(table.time_s, table.easting_m, table.northing_m,
+                                 table.heading_rad, table.pass_index)
+            )  # fmt: skip
+            warnings += [odd] if odd else []
+        warnings += _unlike_depths(files, table)
         return cls(
             crs=target,
             utc=all(raw.utc for raw in files),
@@ -339,6 +347,21 @@ def _joined(tables: Sequence[PingTable]) -> PingTable:
         f.name: np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(PingTable)
     }
     return PingTable(**columns)
+
+
+def _unlike_depths(files: Sequence[RawFile], table: PingTable) -> list[str]:
+    """Tell of files without depth among files with it: their heights have another zero."""
+    known = [
+        bool(np.isfinite(table.depth_m[table.file == number]).any()) for number in range(len(files))
+    ]
+    without = [raw.path.name for raw, there in zip(files, known, strict=True) if not there]
+    if not without or len(without) == len(files):
+        return []
+    named = ", ".join(without[:3]) + (" ..." if len(without) > 3 else "")
+    return [
+        f"no depth in {named}, but in the other files: heights there are relative to the sonar; "
+        "map those files apart"
+    ]
 
 
 def _refuse_unusable(files: Sequence[RawFile], table: PingTable) -> None:

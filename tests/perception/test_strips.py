@@ -54,11 +54,11 @@ def test_moving_the_world_moves_the_objects_and_nothing_else() -> None:
     assert_allclose(other.strip.elevation_m, one.strip.elevation_m, atol=1e-3)
 
 
-def test_without_depth_heights_are_relative_to_the_sonar_and_a_warning_says_so(
+def test_without_depth_heights_are_relative_to_the_sonar_and_the_log_says_so(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     swath = make_swath(flat, SURVEY, np.random.default_rng(4))
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(logging.INFO):
         strip = build_strip(replace(swath, depth_m=np.zeros(SURVEY.n_pings))).strip
     assert "relative to the sonar" in caplog.text
     assert_allclose(np.nanmean(strip.elevation_m), -10.0, atol=0.06)
