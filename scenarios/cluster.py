@@ -15,14 +15,26 @@ class SchedulerLostError(BathynavError):
     """The cluster cannot be reached, or went away."""
 
 
+# glibc's marks above which freed memory goes back, and above which it never was the process's own.
+_HELD = {
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 29,
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 30,
+}
+
+
 @contextmanager
-def open_cluster(scheduler: str | None = None, n_workers: int | None = None) -> Iterator[Any]:
+def open_cluster(
+    scheduler: str | None = None, n_workers: int | None = None, hold_memory: bool = False
+) -> Iterator[Any]:
     """Yield a Dask client: a cluster's by address, or that of a local one, which ends with the block.
 
     Parameters
     ----------
     scheduler : address of a running scheduler (tcp://HOST:PORT); None starts a local cluster.
     n_workers : size of the local cluster; None takes one a core.
+    hold_memory : local workers keep memory that they will want again. Rasters come and go by the dozen: given
+        back to the system and fetched anew each time, as is Dask's default, their pages cost as much
+        as the work on them.
 
     Raises
     ------
@@ -48,6 +60,7 @@ def open_cluster(scheduler: str | None = None, n_workers: int | None = None) -> 
         {
             # Runs have their own memory limit; Dask's would kill a worker for what its server's child took.
             "distributed.worker.memory.terminate": False,
+            **(_HELD if hold_memory else {}),
             # What a worker has to say of its own end is not for the user.
             "logging.distributed": "critical",
         }

@@ -139,7 +139,7 @@ def map_tiles(
     plan = plan_tiles(strips, cell, survey.crs, survey.datum, tile_cells)
     # A local cluster takes seconds to start: a handful of tiles is made here in that time.
     alone = scheduler is None and tiles_to_make(plan, folder) <= _TILES_MADE_HERE
-    with nullcontext() if alone else open_cluster(scheduler, workers) as client:
+    with nullcontext() if alone else open_cluster(scheduler, workers, hold_memory=True) as client:
         store, tiles, made = fuse_tiles(plan, folder, client, progress)
         filled = None
         if fill_m is not None:

@@ -106,7 +106,7 @@ def _one_size(ground: FloatArray, folder: Path, size: int) -> list[Row]:
             write_strip(folder / f"strip-{index:03d}.nc", strip)
     with watch.stage("strips digested and placed"):
         plan = plan_tiles([_filed(p) for p in sorted(folder.glob("*.nc"))], _CELL_M, _CRS)
-    with watch.stage("tiles fused"), open_cluster() as client:
+    with watch.stage("tiles fused"), open_cluster(hold_memory=True) as client:
         store, _, made = fuse_tiles(plan, folder / "tiles", client)
     with watch.stage("COG with overviews"):
         _write(folder / "map.tif", plan, store)
