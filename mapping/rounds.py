@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,9 @@ from mapping.pose_graph import GraphConfig, Link, Solution, perpendicular
 from mapping.registration import Match, match
 from mapping.textures import MatchConfig, Texture, placed_anew, texture
 from perception.records import ElevationStrip, FloatArray, Grid, Progress
+
+# More than two gain little: gathering is short and the rest holds the lock.
+_THREADS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,20 +68,15 @@ def register(
     floor : a map that tells where echoes came from; None what the strips' soundings say of it.
     """
     known = known_floor(corrected) if floor is None else floor
-    placed: dict[int, Texture] = {}
-    results: list[tuple[Window, Match]] = []
-    links: list[Link] = []
-    for done, window in enumerate(windows, start=1):
-        for index in (window.first, window.second):
-            if index not in placed:
-                placed[index] = textures.placed(index, corrected[index], known)
-        ends = [
-            keyframes.nearest(s, line)
-            for s, line in ((window.first, window.first_line), (window.second, window.second_line))
-        ]
-        prior = expected_shift(keyframes, solution, ends[0], ends[1], graph)
+    needed = sorted({index for w in windows for index in (w.first, w.second)})
+    placed = {index: textures.placed(index, corrected[index], known) for index in needed}
+
+    def compare(window: Window) -> tuple[tuple[int, int], Match]:
+        first = keyframes.nearest(window.first, window.first_line)
+        second = keyframes.nearest(window.second, window.second_line)
+        prior = expected_shift(keyframes, solution, first, second, graph)
         search_m = 3.0 * float(np.sqrt(np.linalg.eigvalsh(prior).max())) + 2.0 * cell_m
-        result = match(
+        return (first, second), match(
             placed[window.first],
             placed[window.second],
             (window.easting_m, window.northing_m),
@@ -87,10 +86,18 @@ def register(
             config,
             prior,
         )
-        results.append((window, result))
-        if result.accepted:
-            links.append(_link(corrected, keyframes, solution, window, result, ends, graph, floor))
-        progress(label, done, len(windows))
+
+    results: list[tuple[Window, Match]] = []
+    links: list[Link] = []
+    # Transforms and gridding let go of the interpreter's lock; the order of results is that of the windows.
+    with ThreadPoolExecutor(_THREADS) as pool:
+        for window, (ends, result) in zip(windows, pool.map(compare, windows), strict=True):
+            results.append((window, result))
+            if result.accepted:
+                links.append(
+                    _link(corrected, keyframes, solution, window, result, ends, graph, floor)
+                )
+            progress(label, len(results), len(windows))
     return results, links
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from mapping.crossings import height_steps
 from mapping.fixes import PositionFix
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
-from mapping.overlaps import find_overlaps
+from mapping.overlaps import Window, find_overlaps
 from mapping.placing import at_lines, bridge, on_track
 from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, solve
 from mapping.prior_tie import ties_to_prior
@@ -179,7 +179,8 @@ def correct_survey(
         side_m = max(part * swath_width(strips), least_square_m(cell_m))
         corrected = on_track(thin, keyframes, solution)
         results, links = register(
-            corrected, textures, keyframes, solution, find_overlaps(corrected, side_m), cell_m,
+            corrected, textures, keyframes, solution,
+            enough(find_overlaps(corrected, side_m), len(keyframes)), cell_m,
             config.match, config.graph, config.widest_search_m, floor, progress,
             f"registering, round {len(rounds) + 1}",
         )  # fmt: skip
@@ -251,6 +252,20 @@ def tie_to_map(
             prior_shift_m=(float(shift_m[0]), float(shift_m[1])),
         ),
     )
+
+
+# Small surveys compare every square; large ones about one a keyframe, evenly spread: twice as many would
+# narrow the track by a few per cent only (docs/pose-graph.md).
+_ALL_SQUARES = 2000
+
+
+def enough(windows: Sequence[Window], keyframes: int) -> list[Window]:
+    """Return the windows that are worth their time: all of a small survey's, an even choice of a large one's."""
+    most = max(_ALL_SQUARES, keyframes)
+    if len(windows) <= most:
+        return list(windows)
+    chosen = np.linspace(0, len(windows) - 1, most).round().astype(int)
+    return [windows[i] for i in chosen]
 
 
 def gain_in_likeness(before: CorrectedSurvey, after: CorrectedSurvey) -> float:

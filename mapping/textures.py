@@ -254,7 +254,7 @@ def _spacings(strip: ElevationStrip) -> tuple[float, float]:
     return max(step, 1e-3), max(spacing, 1e-3)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def scatter(
     values: FloatArray,
     weights: FloatArray,
