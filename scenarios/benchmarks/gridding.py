@@ -125,7 +125,7 @@ def _ours(soundings: _Soundings) -> FloatArray:
     )  # fmt: skip
 
 
-def _bincount(index: Any, height: FloatArray) -> tuple[FloatArray, Any]:
+def _bincount(index: Any, height: FloatArray) -> Any:
     cells = _SIDE**2
     return np.bincount(index, height, minlength=cells), np.bincount(index, minlength=cells)
 

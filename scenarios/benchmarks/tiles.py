@@ -52,7 +52,7 @@ def run(progress: Progress) -> Table:
         for done, size in enumerate(sizes, start=1):
             rows += _one_size(ground, Path(folder) / f"{size}x", size)
             progress("tiled maps", done, len(sizes))
-    settings = {"seed": 1, "cell_m": _CELL_M, "sounding_spacing_m": _STEP_M, "tile_cells": 1024,
+    settings: dict[str, object] = {"seed": 1, "cell_m": _CELL_M, "sounding_spacing_m": _STEP_M, "tile_cells": 1024,
                 "workers": os.cpu_count()}  # fmt: skip
     return Table("tiles", tuple(rows), settings)
 
