@@ -52,7 +52,7 @@ def solve_mission(
         k, patches = problem.factor(length)
         surface = problem.surface(sigma, 0.0 if sigma is None else k)
         nodes = [end_node(surface, stop, f"stop {i}") for i, stop in enumerate(stops)]
-        order = best_order(leg_costs(surface, nodes))
+        order = best_order(leg_costs(surface.at_least_height(), nodes))
         plan = replace(
             _along(surface, [stops[i] for i in order], order, problem.grid.crs, config),
             patches=patches,

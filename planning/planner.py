@@ -201,10 +201,12 @@ def plan_on_surface(
     laps = _Laps(progress)
     node_a = end_node(surface, start, "start")
     node_b = end_node(surface, goal, "goal")
-    grid_cost, nodes = guided_search(surface, node_a, node_b, config.neighbours)
+    least = surface.at_least_height()
+    grid_cost, nodes = guided_search(least, node_a, node_b, config.neighbours)
     laps.lap("grid_s")
-    bound = lower_bound(surface, start, goal)
+    bound = lower_bound(least, start, goal)
     laps.lap("bound_s")
+    del least
     ends = np.array([surface.local(np.array(p[0]), np.array(p[1])) for p in (start, goal)])
     if not np.isfinite(grid_cost):
         parted = explain_barrier(surface, node_a, node_b)

@@ -105,7 +105,7 @@ def replan(
     ends = [np.array(surface.local(np.array(p[0]), np.array(p[1]))) for p in (here, goal)]
     old = np.column_stack(surface.local(rest[:, 0], rest[:, 1]))
     guides = [np.concatenate([ends[0][None], old[:-1], ends[1][None]])]
-    field = search(surface, a, b, 16)
+    field = search(surface.at_least_height(), a, b, 16)
     if np.isfinite(field.cost[b]):
         nodes = field.path(*b)
         fresh = np.column_stack([nodes[:, 1] * surface.cell_m[0], nodes[:, 0] * surface.cell_m[1]])

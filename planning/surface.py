@@ -72,6 +72,20 @@ class Surface:
         stack[..., DRIFT_X:] *= -1.0
         return replace(self, stack=stack)
 
+    def at_least_height(self) -> Surface:
+        """Return the surface whose weight holds the price of k sigma too: no route flies lower.
+
+        The grid search and the bound know no altitude; without this they would take the ground under a
+        large sigma for as cheap as any.
+        """
+        if self.k == 0:
+            return self
+        above = self.lower_m - self.bottom_m - self.limits.floor_m
+        stack = self.stack.copy()
+        dear = self.terms.altitude_per_m * np.maximum(0.0, np.nan_to_num(above))
+        stack[..., WEIGHT] += dear.astype(np.float32)
+        return replace(self, stack=stack)
+
     def local(self, easting_m: FloatArray, northing_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return local x, y of map coordinates."""
         return (

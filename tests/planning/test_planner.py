@@ -116,6 +116,22 @@ def test_sigma_lifts_the_route_by_k_sigma_and_a_safer_risk_lifts_it_more():
     assert plans[1].k > plans[0].k > 2.0
 
 
+def test_the_grid_and_the_bound_pay_for_k_sigma_and_uncertain_ground_is_gone_around():
+    sigma = np.full((120, 120), 0.3)
+    grid = grid_of(flat(), sigma_m=sigma)
+    plan = plan_route(grid, at(grid, 60, 15), at(grid, 60, 105), config=QUICK)
+    # Level flight at k sigma above the floor, priced at 0.1 per metre.
+    expected = 90.0 * (1.0 + 0.1 * 0.3 * plan.k)
+    assert_allclose([plan.route.cost, plan.grid_cost], expected, rtol=1e-3)
+    assert 0.98 * expected <= plan.lower_bound <= plan.route.cost
+    sigma[40:80, 45:75] = 3.0
+    unsure = grid_of(flat(), sigma_m=sigma)
+    plan = plan_route(unsure, at(grid, 60, 15), at(grid, 60, 105), config=QUICK)
+    assert_within_limits(unsure, plan)
+    assert np.abs(plan.route.northing_m - at(grid, 60, 0)[1]).max() > 18.0
+    assert plan.lower_bound <= plan.route.cost <= 1.05 * plan.grid_cost
+
+
 def test_heavier_ground_is_gone_around():
     weight = np.ones((120, 120))
     weight[:, 50:70] = 6.0
