@@ -115,6 +115,8 @@ def write_cog(
         "tiled": True, "blockxsize": 512, "blockysize": 512, "interleave": "band",
         "sparse_ok": True, "bigtiff": "if_safer",
     }  # fmt: skip
+    for left in path.parent.glob(f".{path.stem}.*.draft.tif"):
+        left.unlink()  # as large as the map; a killed run's
     draft = path.with_name(f".{path.stem}.{os.getpid()}.draft.tif")
     try:
         with whole_file(path) as temporary, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):

@@ -87,6 +87,7 @@ def test_a_raster_written_by_windows_is_a_valid_cog(tmp_path: Path) -> None:
 
     grid = a_grid(1500, 1300)
     path = tmp_path / "map.tif"
+    (tmp_path / ".map.1.draft.tif").write_bytes(b"a killed run's")
     write_cog(path, Frame.of(grid), ("elevation", "sigma"), windows(grid))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["map.tif"]
     with rasterio.open(path) as raster:
