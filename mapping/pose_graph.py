@@ -42,7 +42,8 @@ class GraphConfig:
     start_with_fixes_m : the same where fixes are given, which then decide.
     shared : correlation of these errors from pass to pass of a dive: 0 each its own, near 1 one
         instrument's constant. `mapping.sharing` chooses it by what the survey says.
-    height_m : 1-sigma of a strip's height offset (depth sensor, tide left over).
+    height_m : 1-sigma of a strip's height offset (depth sensor, tide left over), where the survey does not
+        say otherwise (`mapping.sharing`).
     outlier_probability : chance of refusing a good registration (chi-square tail of the GNC threshold).
     """
 
@@ -53,7 +54,7 @@ class GraphConfig:
     shared: float = 0.0
     start_m: float = 2.0
     start_with_fixes_m: float = 300.0
-    height_m: float = 0.3
+    height_m: float = 0.1
     outlier_probability: float = 0.01
 
 

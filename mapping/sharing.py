@@ -1,8 +1,9 @@
-"""Whether the passes share one compass and log error: decided by what the survey itself says.
+"""What the passes share, compass, log and depth sensor: decided by what the survey itself says.
 
 A dive's course and speed errors may be one constant of the instruments or may change from pass to pass. Taken for one
 constant they are known far better; taken so wrongly they bend the track. Both assumptions predict the same
-data with some probability, and the more probable one is taken.
+data with some probability, and the more probable one is taken. So with the size of the passes' height offsets: small
+ones must not be fitted to the noise of the crossings, large ones (tide, a pressure sensor between dives) must not be denied.
 """
 
 from __future__ import annotations
@@ -11,13 +12,43 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from mapping.keyframes import KeyframeFix, Keyframes
 from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, log_evidence, solve
 
 logger = logging.getLogger(__name__)
 
+# Sizes of height offsets, 1-sigma, that are tried beside the configured one.
+_HEIGHTS_M = (0.03, 0.3)
+# Another size must be so many times as probable (in logarithms) to be taken.
+_LEAST_GAIN = 1.0
 # Each pass its own; mostly alike; one constant but for a tenth of its sigma.
 _CORRELATIONS = (0.0, 0.8, 0.995)
+
+
+def height_size(steps: Sequence[HeightStep], passes: int, config: GraphConfig) -> float:
+    """Return the 1-sigma of the passes' height offsets under which their crossings are most probable.
+
+    Steps are ``A h + noise`` with the offsets h of that size, so their covariance is known for each.
+    """
+    if not steps:
+        return config.height_m
+    z = np.array([step.height_m for step in steps])
+    noise = np.diag([step.sigma_m**2 for step in steps])
+    between = np.zeros((len(steps), passes))
+    for row, step in enumerate(steps):
+        between[row, step.first], between[row, step.second] = -1.0, 1.0
+
+    def log_probability(size_m: float) -> float:
+        covariance = size_m**2 * between @ between.T + noise
+        return float(
+            -0.5 * z @ np.linalg.solve(covariance, z) - 0.5 * np.linalg.slogdet(covariance)[1]
+        )
+
+    own = log_probability(config.height_m)
+    best = max(_HEIGHTS_M, key=log_probability)
+    return best if log_probability(best) > own + _LEAST_GAIN else config.height_m
 
 
 def solve_shared(
@@ -37,6 +68,7 @@ def solve_shared(
     used_links = [x for x, ok in zip(links, first.link_used, strict=True) if ok]
     used_fixes = [x for x, ok in zip(fixes, first.fix_used, strict=True) if ok]
     used_steps = [x for x, ok in zip(steps, first.step_used, strict=True) if ok]
+    config = replace(config, height_m=height_size(used_steps, len(keyframes.starts) - 1, config))
     best, most = config.shared, float("-inf")
     for shared in _CORRELATIONS:
         tried = replace(config, shared=shared)
@@ -44,6 +76,6 @@ def solve_shared(
         logger.info("pass errors correlated by %.3f: log evidence %.2f", shared, found)
         if found > most:
             best, most = shared, found
-    if best == config.shared:
+    if best == config.shared and config == first.config:
         return first
     return solve(keyframes, links, fixes, replace(config, shared=best), steps=steps)

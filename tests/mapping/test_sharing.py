@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes
-from mapping.pose_graph import GraphConfig, log_evidence, solve
-from mapping.sharing import solve_shared
+from mapping.pose_graph import GraphConfig, HeightStep, log_evidence, solve
+from mapping.sharing import height_size, solve_shared
 from perception.records import FloatArray
 from tests.mapping.test_pose_graph import flights, rms
 
@@ -52,3 +53,21 @@ def test_errors_that_differ_are_left_to_differ() -> None:
         log_evidence(keyframes, (), ties, replace(config, shared=kept)) for kept in (0.0, 0.995)
     )
     assert alone > forced + 5.0
+
+
+@pytest.mark.parametrize(("true_m", "low", "high"), [(0.01, 0.0, 0.11), (0.5, 0.25, 1.0)])
+def test_the_size_of_height_offsets_is_that_of_the_crossings(
+    true_m: float, low: float, high: float
+) -> None:
+    rng = np.random.default_rng(9)
+    offset = true_m * rng.normal(size=12)
+    steps = [
+        HeightStep(i, j, float(offset[j] - offset[i] + 0.1 * rng.normal()), 0.1)
+        for i in range(6)
+        for j in range(6, 12)
+    ]
+    assert low < height_size(steps, 12, GraphConfig()) < high
+
+
+def test_without_crossings_the_configured_size_stands() -> None:
+    assert height_size([], 3, GraphConfig(height_m=0.2)) == 0.2
