@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_MOST_ROUNDS = 3
+_MOST_ROUNDS = 2
 # Parts of the evidence: what is less than the first is noise of the comparison itself, and a round that brings
 # less than the second does not pay for another draft.
-_NOISE, _PAYS = 0.02, 0.10
+_NOISE, _PAYS = 0.02, 0.30
 
 
 def refine_on_map(
@@ -71,7 +71,7 @@ def draft_map(
 
     altitude_m = float(np.nanmedian(np.concatenate([strip.altitude_m for strip in strips])))
     # Relief misplaces echoes by its mean over squares of tens of metres: fine cells are not needed.
-    cell_m = max(2.0 * default_cell(strips), altitude_m / 8.0)
+    cell_m = max(2.0 * default_cell(strips), altitude_m / 6.0)
     return invert(looks, cell_m, crs=crs, progress=progress).grid
 
 
