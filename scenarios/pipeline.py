@@ -72,9 +72,6 @@ def _locate_line(scenario: Scenario, out: Path) -> tuple[str, ...]:
     simulated = out / "simulate"
     ground = simulated / "prior.tif" if scenario.locate.map == "prior" else out / "map" / "map.tif"
     line = ["locate", "--map", str(ground), "--nav", str(simulated / "nav.csv")]
-    if scenario.locate.map == "prior" and scenario.prior.correlated_sigma_m > 0:
-        # What is known of a prior map's making comes with it, as a survey report would tell.
-        line += ["--map-error-length", repr(scenario.prior.correlated_length_m)]
     if scenario.locate.side_scan and scenario.locate.track == "return":
         line += ["--swath", str(simulated / "return.xtf")]
     return tuple(line)
