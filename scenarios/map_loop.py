@@ -67,12 +67,14 @@ def draft_map(
     progress: Progress = silent,
 ) -> Grid:
     """Return a map on cells coarse enough to be had in a fraction of the final one's time."""
-    from perception.inversion import invert
+    from perception.inversion import InversionConfig, invert
 
     altitude_m = float(np.nanmedian(np.concatenate([strip.altitude_m for strip in strips])))
     # Relief misplaces echoes by its mean over squares of tens of metres: fine cells are not needed.
     cell_m = max(2.0 * default_cell(strips), altitude_m / 6.0)
-    return invert(looks, cell_m, crs=crs, progress=progress).grid
+    # Its sigma serves as a mean over squares, and the last steps move it by centimetres.
+    quick = InversionConfig(iterations=4, samples=3)
+    return invert(looks, cell_m, quick, crs, progress).grid
 
 
 def tied_to_prior(
