@@ -41,6 +41,7 @@ def run(progress: Progress = silent) -> Table:
         progress("objects", _SEEDS.index(seed), len(_SEEDS))
         rows += _objects(seed)
     progress("objects", len(_SEEDS), len(_SEEDS))
+    rows.append(_relief())
     settings = {"scenario": _SCENARIO, "seeds": list(_SEEDS), "samples": 2 * _SPEED_SAMPLES}
     return Table("echoes", tuple(rows), settings)
 
@@ -52,13 +53,35 @@ def _speed(progress: Progress) -> list[Row]:
     rows: list[Row] = []
     for method, work in (("bathynav", build_strip), ("threshold per ping", threshold_objects)):
         progress("speed", len(rows), 2)
-        began = time.perf_counter()
+        began, used = time.perf_counter(), time.process_time()
         work(swath)
         rate = 60 * swath.n_pings / (time.perf_counter() - began)
         goal = ">= 20000" if method == "bathynav" else ""
         rows.append(Row("2 x 1024 samples", method, "speed", rate, "pings/min", goal))
+        # What other work on the machine does not change; 3 ms is the goal's rate on one core.
+        spent = 1000 * (time.process_time() - used) / swath.n_pings
+        goal = "<= 3 (one core)" if method == "bathynav" else ""
+        rows.append(Row("2 x 1024 samples", method, "processor time", spent, "ms/ping", goal))
     progress("speed", 2, 2)
     return rows
+
+
+def _relief() -> Row:
+    """Count objects listed on the demo's ground without its objects: every one is the relief's."""
+    from scenarios.schema import load_scenario
+    from scenarios.simulation import simulate
+    from scenarios.simulation_files import write_simulation
+
+    demo = load_scenario("demo")
+    land = tuple(
+        item for item in demo.world.terrain if item.kind not in ("mounds", "boulders", "pockmarks")
+    )
+    bare = demo.model_copy(update={"world": demo.world.model_copy(update={"terrain": land})})
+    with tempfile.TemporaryDirectory() as folder:
+        write_simulation(simulate(bare), Path(folder))
+        survey = open_survey([Path(folder) / "survey.xtf"])
+        count = sum(len(build_strip(survey.swath(i)).objects) for i in range(survey.n_passes))
+    return Row("demo without objects", "bathynav", "objects listed", float(count), "", "few")
 
 
 def _plain_swath(rng: np.random.Generator) -> Swath:
