@@ -93,7 +93,7 @@ def invert(
         last = iterate(state, config.iterations, progress, rng)
         deviation, base_sigma = spread(state, last, rng)
     progress("joint inversion", total, total)
-    sigma = honest_sigma(state, deviation, base_sigma)
+    sigma = honest_sigma(state, last, deviation, base_sigma)
     return _result(state, sigma, last, crs or looks[0].swath.crs)
 
 

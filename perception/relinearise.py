@@ -52,9 +52,9 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
             lead_m=state.lead_m,
             lead_sigma_m=state.lead_sigma_m,
         )
-        equations = both(equations, mean_soundings(equations, state.soundings))
         single = one_sided(rows, state.shape)
         held = _held_profiles(state, single, passed)
+        held = both(held, mean_soundings(equations, state.soundings))
         if k > 0 and state.config.shadows:
             equations = both(
                 equations,

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from perception.inversion import invert
-from perception.records import FloatArray, Progress, silent
+from perception.inversion import Look, invert
+from perception.records import FloatArray, Progress, Swath, silent
 from scenarios.benchmarks import Row, Table
 from scenarios.benchmarks.inversion import errors, looks_of
 from scenarios.simulation import Simulation
@@ -93,19 +93,41 @@ def _rows(case: str, error: FloatArray, sigma: FloatArray, soundings: FloatArray
 
 def _large() -> list[Row]:
     """Return seconds and memory of a map of about 1,000 x 1,000 cells."""
-    lines = {**_LINES, "count": 16, "spacing_m": 60.0, "length_m": 1000.0}
-    simulation = _simulated([_fractal(2.6, 100.0)], [lines], 1200.0, _SEED + 50)
-    looks = looks_of(simulation)
-    del simulation
+    looks = [_flat_look(line, np.random.default_rng(_SEED + 50 + line)) for line in range(16)]
     start = time.perf_counter()
     grid = invert(looks, 1.0).grid
     seconds = time.perf_counter() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
-    cells = f"{grid.shape[0]} x {grid.shape[1]} cells"
+    cells = f"{grid.shape[0]} x {grid.shape[1]} cells, 16 lines"
     return [
         Row("large", "joint", "time", seconds, "s", "<= 60", cells),
-        Row("large", "process", "peak memory", peak, "GB", "<= 2", "simulator included"),
+        Row("large", "process", "peak memory", peak, "GB", "<= 2", "echoes included"),
     ]
+
+
+def _flat_look(line: int, rng: np.random.Generator) -> Look:
+    """Return one of sixteen lines over a level floor: Lambert's law and four looks of speckle.
+
+    What is timed does not depend on the relief, and simulating sixteen kilometres would take minutes.
+    """
+    n, samples, reach_m, altitude_m = 2000, 1024, 75.0, 15.0
+    slant = (np.arange(samples) + 0.5) * reach_m / samples
+    tangent = altitude_m / np.sqrt(np.maximum(slant**2 - altitude_m**2, 1.0))
+    power = np.where(slant > altitude_m, tangent**2 / np.sqrt(1 + tangent**2), 1e-4)
+    port, starboard = (
+        np.sqrt(power * rng.standard_gamma(4.0, (n, samples), np.float32) / 4).astype(np.float32)
+        for _ in range(2)
+    )
+    still, nan = np.zeros(n), np.full(n, np.nan)
+    swath = Swath(
+        time_s=np.arange(n) * 0.3, ping=np.arange(n), easting_m=np.full(n, 0.3 + 54.0 * line),
+        northing_m=np.arange(n) * 0.47, depth_m=np.full(n, 45.0), heading_rad=still,
+        pitch_rad=still, roll_rad=still, altitude_hint_m=nan,
+        sample_m=np.full(n, reach_m / samples), port=port, starboard=starboard,
+        sound_speed_m_s=np.full(n, 1500.0), crs="EPSG:32633", pass_index=line,
+    )  # fmt: skip
+    first = altitude_m + 0.1 * np.sin(np.arange(n) * 0.05 + line) + 0.02 * rng.standard_normal(n)
+    return Look(swath, first, np.full(n, 0.03))
 
 
 def _simulated(
@@ -119,7 +141,7 @@ def _simulated(
         "seed": seed,
         "world": {
             "size_east_m": size_m, "size_north_m": size_m, "depth_m": 60.0,
-            "cell_m": 0.25 if size_m < 500 else 0.5, "terrain": terrain, "albedo": {"rms_db": 1.5},
+            "cell_m": 0.25, "terrain": terrain, "albedo": {"rms_db": 1.5},
         },
         "sonar": {"looks": 4.0, "range_m": 75.0},
         "mission": {"block": block, "altitude_m": 15.0, "follow": "depth"},
