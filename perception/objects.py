@@ -264,12 +264,14 @@ def _of_shadow(
     )
     middle, half = shadow.along_extent(seen.track)
     half_across = min(half, 0.5 * (x_end - x_start))
+    # A footprint that no fit has told may be as long as a good part of its shadow.
+    land_m = max(land_m, half, half_across, 0.4 * (x_end - x_start))
     return ObjectRow(
         easting_m=np.nan, northing_m=np.nan, kind="hill" if hill else "crater", height_m=height,
         sigma_m=sigma, slant_range_m=edges.start_m, shadow_length_m=edges.length_m,
         pass_index=0, ping=0, across_m=x_start if hill else 0.5 * (x_start + x_end),
         along_m=middle, half_across_m=half_across, half_along_m=half, lower_bound=shadow.open,
-        probability=object_probability(height, max(half, half_across, land_m), dark, seen.roughness),
+        probability=object_probability(height, land_m, dark, seen.roughness),
     )  # fmt: skip
 
 
