@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import psutil
 import rasterio
 import rasterio.shutil
 from rasterio._err import CPLE_BaseError
@@ -115,8 +116,7 @@ def write_cog(
         "tiled": True, "blockxsize": 512, "blockysize": 512, "interleave": "band",
         "sparse_ok": True, "bigtiff": "if_safer",
     }  # fmt: skip
-    for left in path.parent.glob(f".{path.stem}.*.draft.tif"):
-        left.unlink()  # as large as the map; a killed run's
+    _remove_drafts_of_the_dead(path)
     draft = path.with_name(f".{path.stem}.{os.getpid()}.draft.tif")
     try:
         with whole_file(path) as temporary, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
@@ -137,6 +137,14 @@ def write_cog(
         raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from error
     finally:
         draft.unlink(missing_ok=True)
+
+
+def _remove_drafts_of_the_dead(path: Path) -> None:
+    """Remove what killed runs left of this raster, as large as the map; a running one's is its own."""
+    for left in path.parent.glob(f".{path.stem}.*.draft.tif"):
+        owner = left.name.removesuffix(".draft.tif").rpartition(".")[2]
+        if owner.isdigit() and not psutil.pid_exists(int(owner)):
+            left.unlink(missing_ok=True)
 
 
 def _fill(

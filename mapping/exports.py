@@ -5,7 +5,7 @@ Each is written from `map.tif` window by window, so its size does not matter.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,27 @@ _VARIABLES = {
 FORMATS = (".nc", ".grd", ".bag", ".asc")
 
 
+def check_frame(names: Sequence[str], crs: str) -> None:
+    """Refuse files whose format needs a coordinate system that the map will not have.
+
+    Parameters
+    ----------
+    names : the files' names.
+    crs : the map's; empty none.
+
+    Raises
+    ------
+    InputError
+        A BAG, of which the system is a part, of a map without one.
+    """
+    for name in names:
+        if Path(name).suffix == ".bag" and not crs:
+            raise InputError(
+                f"{name}: a BAG needs a coordinate system and the survey tells none; give the one its "
+                "positions lie in with --crs EPSG:N, or another format (.nc, .grd, .asc)"
+            )
+
+
 def export_map(source: Path, target: Path) -> None:
     """Write a map of ours in the format that the target's suffix names.
 
@@ -56,6 +77,7 @@ def export_map(source: Path, target: Path) -> None:
         )
     try:
         with rasterio.open(existing_file(source)) as raster, whole_file(target) as temporary:
+            check_frame([str(target)], raster.crs.to_wkt() if raster.crs else "")
             if target.suffix in (".nc", ".grd"):
                 _write_netcdf(temporary, raster, gmt=target.suffix == ".grd")
             else:

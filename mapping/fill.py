@@ -105,7 +105,8 @@ def fill_gaps(
     if not known.any():
         return filled, sigma
     near = ndimage.distance_transform_edt(~known) * cell_m <= reach_m
-    rows, cols = np.nonzero(near & ~known)
+    # A height whose sigma nobody knows is no datum to fill from, and no gap either.
+    rows, cols = np.nonzero(near & ~np.isfinite(height_m))
     steps = int(np.ceil(SEARCH * reach_m / cell_m))
     # Whole cells to each neighbour; rays of unequal angle are told apart by rounding alone.
     angle = 2 * np.pi * np.arange(_RAYS) / _RAYS

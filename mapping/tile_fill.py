@@ -67,6 +67,7 @@ def make_fill(
         np.asarray(layer[inner], np.float32)
         for layer in fill_gaps(height, sigma, plan.cell_m, reach_m, variogram)
     )
+    store.unmark(tile, FILLED)
     store.write(where, {"fill": filled, "fill_sigma": filled_sigma})
     store.mark(tile, key, {"filled": int(np.isfinite(filled).sum())}, FILLED)
     return tile

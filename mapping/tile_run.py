@@ -88,6 +88,7 @@ def make_tile(plan_path: str, stamp: int, tile: Tile, key: str) -> Tile:
     plan = plan_of(plan_path, stamp)
     layers = fuse_tile(plan, tile)
     store = store_of(str(Path(plan_path).parent), stamp)
+    store.unmark(tile)
     store.write(plan.slices(tile), layers)
     store.mark(tile, key, tile_figures(layers))
     return tile

@@ -84,6 +84,22 @@ class TileStore:
         said = {"key": key, "figures": dict(figures)}
         write_text(self._mark(tile, stage), json.dumps(said) + "\n")
 
+    def unmark(self, tile: tuple[int, int], stage: str = FUSED) -> None:
+        """Take a tile's mark away before its chunks are overwritten.
+
+        A run killed between the two would leave them under the key of what was there before, and a later
+        run of that key would take them for its own.
+
+        Raises
+        ------
+        InputError
+            The folder may not be written.
+        """
+        try:
+            self._mark(tile, stage).unlink(missing_ok=True)
+        except OSError as error:
+            raise _unwritable(self.folder, error) from error
+
     def figures(self, tile: tuple[int, int], key: str, stage: str = FUSED) -> dict[str, Any] | None:
         """Return a tile's figures; None where it is not there as the key has it."""
         try:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import netCDF4
@@ -10,7 +14,7 @@ import pytest
 import rasterio
 
 from mapping.cog import Frame, write_cog
-from mapping.exports import export_map
+from mapping.exports import check_frame, export_map
 from mapping.rasters import open_map, read_map, write_map
 from perception.records import Grid, InputError
 
@@ -87,7 +91,6 @@ def test_a_raster_written_by_windows_is_a_valid_cog(tmp_path: Path) -> None:
 
     grid = a_grid(1500, 1300)
     path = tmp_path / "map.tif"
-    (tmp_path / ".map.1.draft.tif").write_bytes(b"a killed run's")
     write_cog(path, Frame.of(grid), ("elevation", "sigma"), windows(grid))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["map.tif"]
     with rasterio.open(path) as raster:
@@ -111,6 +114,29 @@ def test_a_raster_written_by_windows_is_a_valid_cog(tmp_path: Path) -> None:
         first = [min(o for o in page.dataoffsets if o) for page in pages]
         assert offsets == sorted(offsets) and max(offsets) < min(first)
         assert first == sorted(first, reverse=True)
+
+
+def test_drafts_of_killed_runs_go_and_those_of_running_ones_stay(tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (tmp_path / f".map.{gone.pid}.draft.tif").write_bytes(b"a killed run's")
+    running = f".map.{os.getppid()}.draft.tif"
+    (tmp_path / running).write_bytes(b"another run's")
+    grid = a_grid(80, 60)
+    write_cog(tmp_path / "map.tif", Frame.of(grid), ("elevation", "sigma"), windows(grid))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [running, "map.tif"]
+
+
+def test_a_bag_without_coordinate_system_is_refused_for_what_it_is(tmp_path: Path) -> None:
+    write_map(tmp_path / "map.tif", replace(a_grid(80, 60), crs=""))
+    for suffix in (".nc", ".grd", ".asc"):
+        export_map(tmp_path / "map.tif", tmp_path / f"map{suffix}")
+    with pytest.raises(InputError, match=r"map\.bag: a BAG needs a coordinate system"):
+        export_map(tmp_path / "map.tif", tmp_path / "map.bag")
+    assert not (tmp_path / "map.bag").exists()
+    with pytest.raises(InputError, match="--crs EPSG:N"):
+        check_frame(["map.nc", "map.bag"], "")
+    check_frame(["map.bag"], "EPSG:32630")
 
 
 def test_a_window_that_is_never_written_is_no_data(tmp_path: Path) -> None:

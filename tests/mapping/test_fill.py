@@ -128,6 +128,19 @@ def test_a_window_with_its_rim_is_filled_as_the_whole_is() -> None:
         np.testing.assert_allclose(other[inner], one[60:110, 50:100], rtol=1e-9)
 
 
+def test_a_height_without_sigma_is_no_gap() -> None:
+    rng = np.random.default_rng(4)
+    known = holed(a_floor("middling", rng, 80), rng, holes=3)
+    sigma = np.where(np.isfinite(known), 0.1, np.nan)
+    unsure = np.isfinite(known) & (rng.random(known.shape) < 0.02)
+    sigma[unsure] = np.nan
+    grid, filled = fill_map(Grid(known, 0.0, 40.0, 0.5, "", sigma), 4.0)
+    there = np.isfinite(known)
+    assert unsure.any() and filled.any() and not filled[there].any()
+    np.testing.assert_array_equal(grid.elevation_m[there], known[there])
+    np.testing.assert_array_equal(grid.sigma_m[there], sigma[there])
+
+
 def test_a_map_that_cannot_be_filled_is_refused() -> None:
     height = np.full((5, 5), np.nan)
     height[2, 2] = -30.0

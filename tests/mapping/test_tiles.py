@@ -162,6 +162,41 @@ def test_a_killed_run_goes_on_and_changed_strips_are_made_anew(tmp_path: Path) -
     assert TileStore(folder).read("elevation", (slice(0, 1), slice(0, 1))).shape == (1, 1)
 
 
+def test_a_run_killed_between_tile_and_mark_leaves_no_mark_of_an_older_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A is done, B (one strip higher) is killed before it marks, A again: no tile of B is taken for A's."""
+    from mapping.tile_fill import fill_tiles
+
+    strips, track = a_survey(np.random.default_rng(8))
+    plan = a_plan(tmp_path, strips, track, 1.0, 1000)
+    folder = tmp_path / "tiles"
+    store, _, _ = fuse_tiles(plan, folder)
+    fill_tiles(plan, store, 4.0)
+    expected = {name: whole(store, name, plan) for name in ("elevation", "fill")}
+    raised = replace(plan.strips[1], strip=replace(plan.strips[1].strip, height_m=5.0))
+    moved = replace(plan, strips=(plan.strips[0], raised, plan.strips[2]))
+
+    def killed(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    for stage in ("marks", "fill-marks"):
+        with monkeypatch.context() as patched:
+            if stage == "fill-marks":
+                fuse_tiles(moved, folder)
+            patched.setattr(TileStore, "mark", killed)
+            with pytest.raises(KeyboardInterrupt):
+                if stage == "marks":
+                    fuse_tiles(moved, folder)
+                else:
+                    fill_tiles(moved, store, 4.0)
+        _, _, new = fuse_tiles(plan, folder)
+        fill_tiles(plan, store, 4.0)
+        assert new == len(plan.tiles())
+        for name, values in expected.items():
+            np.testing.assert_array_equal(whole(store, name, plan), values)
+
+
 def test_a_plan_comes_back_as_it_was(tmp_path: Path) -> None:
     strips, track = a_survey(np.random.default_rng(4))
     plan = a_plan(tmp_path, strips, track, 1.0, 64)
