@@ -57,6 +57,10 @@ class StripConfig:
     given_bottom: GivenBottom | None = None
 
 
+class BottomFileError(InputError):
+    """A bottom track from a file does not fit its survey: the file's fault, not the pass's."""
+
+
 @dataclass(frozen=True, slots=True)
 class PassResult:
     """All that one pass gave.
@@ -97,6 +101,8 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
     ------
     InputError
         The pass has fewer than 10 pings or no echo above the noise to track a bottom in.
+    BottomFileError
+        The given bottom does not fit the pass.
     """
     config = config or StripConfig()
     if swath.n_pings < 10:
@@ -105,11 +111,7 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
             "at least 10 are needed"
         )
     port, starboard, sample_m = common_samples(swath)
-    if config.given_bottom is not None:
-        bottom = config.given_bottom.of(swath)
-    else:
-        bottom = track_bottom(port, starboard, sample_m, swath.altitude_hint_m, config.bottom)
-    tracked = bottom
+    bottom = tracked = _bottom_of(swath, port, starboard, sample_m, config)
     if not bottom.valid.any():
         raise InputError(
             f"{swath.source or 'swath'}: pass {swath.pass_index} shows no bottom in "
@@ -117,7 +119,7 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
         )
     along_m = progress_along(swath.easting_m, swath.northing_m, swath.time_s)
     # Where nothing is known of the depth there is nothing to level either.
-    swath, lead_m = levelled(replace(swath, depth_m=_depth(swath)), bottom.first_return_m)
+    swath, lead_m = levelled(replace(swath, depth_m=known_depth(swath)), bottom.first_return_m)
     depth_m = swath.depth_m
     # Heights along the line of soundings, levelled over all lines at once.
     sounded = -(depth_m + bottom.altitude_m)
@@ -202,8 +204,26 @@ def _ping_flags(swath: Swath, valid: BoolArray, saturated: tuple[BoolArray, Bool
     return flags
 
 
-def _depth(swath: Swath) -> FloatArray:
-    """Return the sonar's depth (n,); zero, with one warning, where the file has none."""
+def _bottom_of(
+    swath: Swath, port: FloatArray, starboard: FloatArray, sample_m: float, config: StripConfig
+) -> BottomTrack:
+    """Return the bottom of the file that was given, else the tracker's."""
+    given = config.given_bottom
+    # The file that `strips` wrote says nothing of a pass that gave no strip: such a pass is tracked, and refused
+    # again.
+    silent = given is not None and not np.isin(swath.ping, given.ping).any()
+    if given is None or silent:
+        tracked = track_bottom(port, starboard, sample_m, swath.altitude_hint_m, config.bottom)
+        if given is None or not tracked.valid.any():
+            return tracked
+    try:
+        return given.of(swath)
+    except InputError as error:
+        raise BottomFileError(str(error)) from error
+
+
+def known_depth(swath: Swath) -> FloatArray:
+    """Return the sonar's depth (n,), NaN interpolated; zero where the file has none."""
     depth = np.asarray(swath.depth_m, float)
     known = np.isfinite(depth)
     if not known.any() or np.all(depth[known] == 0):

@@ -188,7 +188,9 @@ def _run_stage(stage: Stage, out: Path, key: str, quiet: bool) -> float:
     try:
         # The stage's own table would drown the mission's; its bars, on standard error, stay.
         with contextlib.redirect_stdout(io.StringIO()):
-            bathynav.main([*line, "--quiet"] if quiet else line, standalone_mode=False)
+            # `map` comes after `strips` here and takes its passes up.
+            line = [*line, "--quiet"] if quiet else line
+            bathynav.main(line, standalone_mode=False, obj={"keep_passes": True})
     except NoPathError:
         # A route that cannot exist is a result: the folder's metrics.json says why.
         if stage.name != "plan":

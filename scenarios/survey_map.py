@@ -6,8 +6,7 @@ Each function is one stage; the arithmetic lives in `perception` and `mapping`.
 from __future__ import annotations
 
 import hashlib
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,12 +33,11 @@ from perception.records import (
     Trajectory,
     silent,
 )
-from perception.strips import PassResult, StripConfig, build_strip, common_samples
+from perception.strips import PassResult, StripConfig, common_samples, known_depth
+from scenarios.passes import strips_of
 
 if TYPE_CHECKING:
     from perception.inversion import InversionResult, Look
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,41 +195,22 @@ def build_passes(
     survey: Survey,
     progress: Progress = silent,
     config: StripConfig | None = None,
-    tell: Callable[[int, PassResult], None] | None = None,
 ) -> tuple[PassSummary, ...]:
-    """Turn every pass into a strip, reading one pass at a time.
-
-    Parameters
-    ----------
-    tell : called with the number and the whole result of each pass, before it is let go.
-
-    Raises
-    ------
-    InputError
-        No pass gives a strip; single ones that do not are left out with a warning.
-    """
+    """Turn every pass into a strip, reading one pass at a time; errors as `strips_of`."""
     key = (*identity(survey), config)
-    if tell is None and key in _recent:
+    if key in _recent:
         return _recent[key]
-    results: list[PassSummary] = []
-    refused: list[str] = []
-    for index in range(survey.n_passes):
-        progress("echoes to strips", index, survey.n_passes)
-        try:
-            result = build_strip(survey.swath(index), config)
-        except InputError as error:
-            refused.append(str(error))
-            logger.warning("%s; left out", error)
-            continue
-        if tell is not None:
-            tell(index, result)
-        results.append(PassSummary.of(result))
-    progress("echoes to strips", survey.n_passes, survey.n_passes)
-    if not results:
-        raise InputError(refused[0] if refused else "the survey holds no pass to make a strip of")
+    results = tuple(PassSummary.of(r) for _, r in strips_of(survey, config, progress))
+    keep_passes(survey, config, results)
+    return results
+
+
+def keep_passes(
+    survey: Survey, config: StripConfig | None, passes: tuple[PassSummary, ...]
+) -> None:
+    """Keep a survey's passes for the next `build_passes` of this process; the last survey's go."""
     _recent.clear()
-    _recent[key] = tuple(results)
-    return _recent[key]
+    _recent[(*identity(survey), config)] = passes
 
 
 def identity(survey: Survey) -> tuple[object, ...]:
@@ -379,6 +358,8 @@ def _look(
         port=np.sqrt(port_power),
         starboard=np.sqrt(starboard_power),
         sample_m=np.full(swath.n_pings, sample_m),
+        # A height is moved by the pass's offset and pitch whether the file knows it or not.
+        depth_m=known_depth(swath),
         flags=None,
     )
     port, starboard = result.masks()

@@ -67,9 +67,10 @@ def command(
     from perception.strip_files import write_strip
     from perception.strips import StripConfig
     from scenarios.outputs import write_metrics
+    from scenarios.passes import strips_of
     from scenarios.plots_strips import plot_pass
-    from scenarios.report.contacts import contacts_of, write_contacts
-    from scenarios.survey_map import build_passes
+    from scenarios.report.contacts import contacts_of, pictured, write_contacts
+    from scenarios.survey_map import PassSummary, keep_passes
 
     set_verbosity(quiet, verbose)
     prepare_out(out)
@@ -82,6 +83,11 @@ def command(
     installation = read_installation(install, tide, sound_speed)
     began = time.perf_counter()
     measured: dict[str, float] = {}
+    # A survey may be larger than memory: a pass is let go once it is written, but for a mission, whose map
+    # comes next.
+    keep = bool((click.get_current_context().obj or {}).get("keep_passes"))
+    tables: list[ObjectTable] = []
+    kept: list[PassSummary] = []
     contacts: list[Contact] = []
     bottoms: list[str] = []
     with progress_bars(quiet) as progress:
@@ -90,17 +96,19 @@ def command(
             for warning in survey.warnings:
                 click.echo(f"note: {warning}", err=True)
 
-        def write(index: int, result: PassResult) -> None:
-            write_strip(out / f"strip-{index:03d}.nc", result.strip, survey.utc)
-            plot_pass(out / f"strip-{index:03d}.png", result)
-            contacts.extend(contacts_of(result))
+        for index, result in strips_of(survey, config, progress):
             strip = result.strip
+            write_strip(out / f"strip-{index:03d}.nc", strip, survey.utc)
+            plot_pass(out / f"strip-{index:03d}.png", result)
+            contacts = pictured([*contacts, *contacts_of(result)])
             bottoms.extend(bottom_rows(strip.time_s, strip.ping, strip.pass_index, result.tracked,
                                        survey.utc, given is not None))  # fmt: skip
             _add_up(measured, result)
-
-        # One pass in memory at a time: a survey may be larger than memory.
-        tables = [p.objects for p in build_passes(survey, progress, config, write)]
+            tables.append(result.objects)
+            if keep:
+                kept.append(PassSummary.of(result))
+        if keep:
+            keep_passes(survey, config, tuple(kept))
     objects = ObjectTable.joined(tables)
     write_objects_csv(out / "objects.csv", objects)
     write_bottom_csv(out / "bottom.csv", bottoms)

@@ -6,7 +6,7 @@ import base64
 import html
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +65,15 @@ def contacts_of(result: PassResult) -> list[Contact]:
             snippet=_snippet(result, i),
         )
         for i in range(len(table))
+    ]
+
+
+def pictured(contacts: Sequence[Contact]) -> list[Contact]:
+    """Return the contacts with pictures of the likeliest only: as many as the page will show."""
+    ranked = sorted(range(len(contacts)), key=lambda i: -contacts[i].probability)
+    unseen = set(ranked[_MOST:])
+    return [
+        replace(c, snippet=b"") if i in unseen and c.snippet else c for i, c in enumerate(contacts)
     ]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.strips import build_strip
-from scenarios.report.contacts import contacts_of, write_contacts
+from scenarios.report.contacts import contacts_of, pictured, write_contacts
 from tests.perception.echo_fixtures import Survey, box, make_swath
 
 CRS = "EPSG:32619"
@@ -38,3 +38,14 @@ def test_no_contact_is_said_in_words(tmp_path: Path) -> None:
     write_contacts(tmp_path / "contacts.html", [], "a <b>", CRS)
     page = (tmp_path / "contacts.html").read_text()
     assert "No contact stands out" in page and "a &lt;b&gt;" in page
+
+
+def test_only_contacts_that_the_page_shows_keep_their_pictures() -> None:
+    swath = make_swath(
+        box(1.0, 15, 10, 0.8, 0.8), Survey(n_pings=80, n_samples=500), np.random.default_rng(5)
+    )
+    contact = contacts_of(build_strip(swath))[0]
+    many = [replace(contact, probability=i / 1000) for i in range(500)]
+    kept = pictured(many)
+    assert [replace(c, snippet=contact.snippet) for c in kept] == many
+    assert [bool(c.snippet) for c in kept] == [False] * 100 + [True] * 400
