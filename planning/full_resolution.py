@@ -82,10 +82,7 @@ def plan_large(
     The plan, its cost by the reduced map's weights, and the number of stretches planned anew.
     """
     plan = solve(problem, start, goal, config)
-    if (
-        plan.route is None
-        and np.isfinite(full.reduced.loose_m).sum() > np.isfinite(problem.grid.elevation_m).sum()
-    ):
+    if plan.route is None and full.reduced.loose_has_more:
         looser = replace(problem, grid=full.reduced.loose)
         tried = solve(looser, start, goal, config)
         if tried.route is not None:
@@ -128,13 +125,18 @@ class _Windows:
     """The stored raster along a route."""
 
     def __init__(self, opened: OpenMap, full: FullMap, problem: Problem) -> None:
-        self.opened, self.full, self.problem = opened, full, problem
+        # Decided once, on the whole map: a window may lie on dry ground alone.
+        self.problem = replace(problem, submerged=problem.under_water())
+        self.opened, self.full = opened, full
 
     def surface(self, box: tuple[float, float, float, float], k: float, margin_m: float) -> Surface:
         """Return the surface of a window under the clearance of the whole route."""
         grid = window_of(self.opened, box, margin_m)
         if self.problem.grid.sigma_m is None:
             grid = replace(grid, sigma_m=None)
+        elif grid.sigma_m is None or not np.isfinite(grid.sigma_m).any():
+            # Sigma is known elsewhere: ground without one is barred here as on the whole map.
+            grid = replace(grid, elevation_m=np.full(grid.shape, np.nan))
         problem = replace(
             self.problem, grid=grid, weight=self._weights(grid), forbidden=self.full.forbidden(grid),
             position_sigma_m=self.full.position_sigma(grid),

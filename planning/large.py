@@ -19,6 +19,7 @@ from mapping.rasters import OpenMap, open_map
 from perception.files import existing_file
 from perception.records import (
     REGION_CLASSES,
+    BoolArray,
     FloatArray,
     Grid,
     InputError,
@@ -52,6 +53,25 @@ def map_crs(path: Path) -> str:
         return opened.source.crs.to_string() if opened.source.crs else ""
 
 
+def is_dry(path: Path) -> bool:
+    """Tell whether all heights of a map lie above its zero, row band by row band up to the first below."""
+    with open_map(path) as opened:
+        height, width = opened.shape
+        step = max(1, _BAND_CELLS // width)
+        for first in range(0, height, step):
+            part = opened.read(slice(first, min(height, first + step)), slice(0, width))
+            if (part.elevation_m <= 0).any():
+                return False
+    return True
+
+
+def map_bounds(path: Path) -> tuple[float, float, float, float]:
+    """Return west, south, east and north of a map without reading it; refusals of `read_map`."""
+    with open_map(path) as opened:
+        west, south, east, north = (float(v) for v in opened.source.bounds)
+        return west, south, east, north
+
+
 def reading_seconds(cells: int) -> float:
     """Return about how long one reading of so many cells takes."""
     return cells / _CELLS_PER_S
@@ -64,20 +84,27 @@ class Reduced:
     Attributes
     ----------
     grid : means of the blocks' heights, worst sigma; a block with any cell of no data is no data.
-    loose_m : (rows, cols) heights where a block may lack up to half of its cells.
+    loose : the same where a block may lack up to half of its cells, and any of its sigmas.
     block : cells along a block's side.
     cell_m : width and height of a cell as stored.
+    lowest_m : height of the lowest cell.
     """
 
     grid: Grid
-    loose_m: FloatArray
+    loose: Grid
     block: int
     cell_m: tuple[float, float]
+    lowest_m: float
 
     @property
-    def loose(self) -> Grid:
-        """The map with half-filled blocks counted in."""
-        return replace(self.grid, elevation_m=self.loose_m)
+    def loose_has_more(self) -> bool:
+        """Whether half-filled blocks open ground that full ones do not."""
+        return bool(_usable(self.loose).sum() > _usable(self.grid).sum())
+
+
+def _usable(grid: Grid) -> BoolArray:
+    known = np.isfinite(grid.elevation_m)
+    return known if grid.sigma_m is None else known & np.isfinite(grid.sigma_m)
 
 
 def read_reduced(path: Path, sigma_m: float | None = None, progress: Progress = silent) -> Reduced:
@@ -86,15 +113,19 @@ def read_reduced(path: Path, sigma_m: float | None = None, progress: Progress = 
         height, width = opened.shape
         block = max(1, math.ceil(math.sqrt(height * width / REDUCED_CELLS)))
         rows, cols = height // block, width // block
-        mean, loose, sigma = (np.full((rows, cols), np.nan) for _ in range(3))
+        mean, loose, sigma, loose_sigma = (np.full((rows, cols), np.nan) for _ in range(4))
+        lowest = math.inf
         step = max(1, _BAND_CELLS // (width * block))
         for first in range(0, rows, step):
             last = min(rows, first + step)
             part = opened.read(slice(first * block, last * block), slice(0, cols * block))
             mean[first:last], loose[first:last] = _means(part.elevation_m, block)
+            lowest = float(np.fmin.reduce(part.elevation_m, axis=None, initial=lowest))
             if part.sigma_m is not None:
                 # The worst of a block stands for it; one without a sigma leaves it without.
                 sigma[first:last] = _blocks(part.sigma_m, block).max(axis=(1, 3))
+                of_heights = np.where(np.isfinite(part.elevation_m), part.sigma_m, np.nan)
+                loose_sigma[first:last] = np.fmax.reduce(_blocks(of_heights, block), axis=(1, 3))
             progress("reading the map", last, rows)
         corner = opened.read(slice(0, 1), slice(0, 1))
     if not np.isfinite(loose).any():
@@ -102,12 +133,18 @@ def read_reduced(path: Path, sigma_m: float | None = None, progress: Progress = 
     grid = replace(
         corner,
         elevation_m=mean,
-        sigma_m=sigma if np.isfinite(sigma).any() else None,
+        sigma_m=sigma,
         count=None,
         cell_m=block * corner.cell_m,
         cell_height_m=block * corner.cell_north_m,
     )
-    return Reduced(grid, loose, block, (corner.cell_m, corner.cell_north_m))
+    looser = replace(grid, elevation_m=loose, sigma_m=loose_sigma)
+    if not np.isfinite(loose_sigma).any():
+        grid, looser = replace(grid, sigma_m=None), replace(looser, sigma_m=None)
+    elif not np.isfinite(sigma).any():
+        # Sigma lacks somewhere in every block: what the file does tell of it must not be left out.
+        grid = looser
+    return Reduced(grid, looser, block, (corner.cell_m, corner.cell_north_m), lowest)
 
 
 def _blocks(values: FloatArray, block: int) -> FloatArray:

@@ -148,7 +148,6 @@ def solve(
         raise InputError(
             f"start and goal are the same place ({start[0]:.2f},{start[1]:.2f}); move one of them"
         )
-    problem = replace(problem, submerged=not _dry(problem.grid, start, goal))
     sigma = problem.clearance_sigma_m()
     length = 1.3 * straight
     while True:
@@ -160,15 +159,6 @@ def solve(
             return plan
         # The route came out longer than the risk was shared out for: share it anew.
         length = 1.05 * plan.route.length_m
-
-
-def _dry(grid: Grid, start: tuple[float, float], goal: tuple[float, float]) -> bool:
-    """Tell whether the map is no sea floor at all: both ends stand above its zero.
-
-    A dry terrain model stands in for a sea floor then, and its zero is no water's surface.
-    """
-    ends = grid.sample(np.array([start[0], goal[0]]), np.array([start[1], goal[1]]))
-    return bool(np.nanmin(grid.elevation_m) > 0 and (ends > 0).all())
 
 
 class _Laps:

@@ -30,7 +30,7 @@ class Problem:
     currents : of the water; None still.
     risk : probability that the floor is broken anywhere along the route.
     correlation_m : distance over which the map's errors are independent; NaN 10 cells.
-    submerged : whether height 0 is the water's surface.
+    submerged : whether height 0 is the water's surface; None asks the grid (`under_water`).
     """
 
     grid: Grid
@@ -42,7 +42,16 @@ class Problem:
     currents: Currents | None = None
     risk: float = 0.01
     correlation_m: float = math.nan
-    submerged: bool = True
+    submerged: bool | None = None
+
+    def under_water(self) -> bool:
+        """Tell whether height 0 is the water's surface, which no route may leave.
+
+        A dry terrain model, all of it above its zero, stands in for a sea floor: its zero is none.
+        """
+        if self.submerged is not None:
+            return self.submerged
+        return not float(np.fmin.reduce(self.grid.elevation_m, axis=None)) > 0
 
     def clearance_sigma_m(self) -> FloatArray | None:
         """Return (rows, cols) sigma that the clearance must cover; None where nothing is uncertain."""
@@ -68,8 +77,8 @@ class Problem:
             dear = self.terms.position_per_m * np.nan_to_num(self.position_sigma_m)
             weight = dear + (1.0 if weight is None else weight)
         return build_surface(
-            self.grid, self.limits, self.terms, weight, sigma_m, k, self.forbidden, self.submerged,
-            self.currents,
+            self.grid, self.limits, self.terms, weight, sigma_m, k, self.forbidden,
+            self.under_water(), self.currents,
         )  # fmt: skip
 
     def surface_for(self, length_m: float) -> tuple[Surface, float]:

@@ -86,10 +86,14 @@ def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked
     began = time.perf_counter()
     weight = _weights(grid, given, reduced)
     more: dict[str, Any] = {"regions_s": time.perf_counter() - began}
-    bars, errors = no_go(given.avoid, grid.crs), position_sigma(given.position_sigma)
     problem = posed(given, grid, from_true_north(limits, grid, given.start, given.goal), weight)
     if reduced is None:
         return Asked(problem, None, more)
+    problem = replace(problem, submerged=not reduced.lowest_m > 0)
+    bars, errors = (
+        no_go(given.avoid, grid.crs),
+        position_sigma(given.position_sigma, given.map_path),
+    )
     if given.error_correlation is None:
         # Ten cells as stored, not ten blocks: fewer patches would take k for smaller than it is.
         problem = replace(problem, correlation_m=10.0 * max(reduced.cell_m))
@@ -109,7 +113,7 @@ def posed(given: Given, grid: Grid, limits: VehicleLimits, weight: FloatArray | 
         terms=read_terms(given.cost_path),
         weight=weight,
         forbidden=no_go(given.avoid, grid.crs)(grid),
-        position_sigma_m=position_sigma(given.position_sigma)(grid),
+        position_sigma_m=position_sigma(given.position_sigma, given.map_path)(grid),
         currents=read_currents(given.currents, grid) if given.currents else None,
         risk=given.risk,
         correlation_m=math.nan if given.error_correlation is None else given.error_correlation,
@@ -121,9 +125,10 @@ def read_around(
 ) -> Problem:
     """Pose the problem of a survey or a replanning; of a large map only what lies around it is read."""
     from mapping.rasters import read_map
-    from planning.large import MOST_CELLS, raster_cells, read_window
+    from planning.large import MOST_CELLS, is_dry, raster_cells, read_window
 
-    if raster_cells(given.map_path) > MOST_CELLS:
+    large = raster_cells(given.map_path) > MOST_CELLS
+    if large:
         grid = read_window(given.map_path, box, margin_m, given.map_sigma)
         if grid.elevation_m.size > MOST_CELLS:
             raise InputError(
@@ -131,13 +136,20 @@ def read_around(
                 f"asked for, more than {MOST_CELLS / 1e6:.0f}; divide it, or coarsen the map: "
                 "gdal_translate -r average -tr"
             )
+        if grid.sigma_m is not None and not (grid.sigma_m >= 0).any():
+            # A band in name only here: the run must tell that it covers no error of the map.
+            grid = replace(grid, sigma_m=None)
     else:
         grid = read_map(given.map_path, given.map_sigma)
     _tell_of_sigma(given, grid, limits)
     weight = None
     if given.old_route is not None:
         weight = _weights(grid, given, None)
-    return posed(given, grid, limits, weight)
+    problem = posed(given, grid, limits, weight)
+    if large and not problem.under_water():
+        # What was read lies on dry ground; whether all of the map does, only the rest of it tells.
+        problem = replace(problem, submerged=not is_dry(given.map_path))
+    return problem
 
 
 def _reduce(given: Given, cells: int, progress: Progress) -> Reduced:
@@ -181,30 +193,45 @@ def from_true_north(
     return replace(limits, **changed)
 
 
-def position_sigma(path: Path | None) -> Callable[[Grid], FloatArray | None]:
-    """Return what gives the expected position error on a grid; None where no file is given."""
+def position_sigma(path: Path | None, map_path: Path) -> Callable[[Grid], FloatArray | None]:
+    """Return what gives the expected position error on a grid; None where no file is given.
+
+    Coverage is asked of the whole map, not of the grid: a window of it may lie beside the raster.
+    """
     if path is None:
         return lambda grid: None
     import numpy as np
 
     from mapping.rasters import open_map
+    from planning.large import map_bounds
 
     with open_map(path) as opened:
         names = [name or "" for name in opened.source.descriptions]
         # An observability map has a band for every heading: what counts is their mean.
         band = names.index(_EXPECTED) + 1 if _EXPECTED in names else opened.elevation_band
         raster = replace(opened, elevation_band=band, down=False).read_whole()
+    if np.nanmin(raster.elevation_m) < 0:
+        raise InputError(f"{path}: holds a negative error ({np.nanmin(raster.elevation_m):g} m)")
+    if not _knows_within(raster, map_bounds(map_path)):
+        raise NoOverlapError(f"{path}: does not cover the map; give a raster of the same area")
+    worst = np.nanmax(raster.elevation_m)
 
     def on(grid: Grid) -> FloatArray | None:
         sampled = raster.sample(*np.meshgrid(*grid.centres()))
-        if not np.isfinite(sampled).any():
-            raise NoOverlapError(f"{path}: does not cover the map; give a raster of the same area")
-        if np.nanmin(sampled) < 0:
-            raise InputError(f"{path}: holds a negative error ({np.nanmin(sampled):g} m)")
         # Where nothing is known of the position, the worst that is known holds.
-        return np.where(np.isfinite(sampled), sampled, np.nanmax(raster.elevation_m))
+        return np.where(np.isfinite(sampled), sampled, worst)
 
     return on
+
+
+def _knows_within(raster: Grid, box: tuple[float, float, float, float]) -> bool:
+    """Tell whether a raster has a value in a box (west, south, east, north), to a cell of its own."""
+    import numpy as np
+
+    easting, northing = raster.centres()
+    cols = (easting > box[0] - raster.cell_m) & (easting < box[2] + raster.cell_m)
+    rows = (northing > box[1] - raster.cell_north_m) & (northing < box[3] + raster.cell_north_m)
+    return bool(np.isfinite(raster.elevation_m[np.ix_(rows, cols)]).any())
 
 
 def no_go(path: Path | None, crs: str) -> Callable[[Grid], BoolArray | None]:

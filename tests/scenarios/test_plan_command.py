@@ -13,11 +13,15 @@ import pytest
 import shapely
 from click.testing import CliRunner
 
-from mapping.rasters import write_bands, write_map
+from mapping.rasters import open_map, write_bands, write_map
 from mapping.vectors import write_layer
 from perception.geodesy import convergence
-from perception.records import Grid, NoPathError
+from perception.records import Grid, NoOverlapError, NoPathError
+from planning.full_resolution import FullMap, _Windows
+from planning.large import is_dry, read_reduced
+from planning.problem import Problem
 from scenarios.commands.plan import command
+from scenarios.route_inputs import position_sigma
 from tests.planning.terrains import NORTH, WEST, canyon, flat, grid_of
 
 COLUMNS = ["easting_m", "northing_m", "depth_m", "altitude_m", "heading_deg", "distance_m"]
@@ -393,3 +397,76 @@ def test_an_observability_map_makes_ground_dear_by_its_mean_error(tmp_path):
     assert result.exception is None, result.exception
     metrics = json.loads((tmp_path / "o" / "metrics.json").read_text())
     np.testing.assert_allclose(metrics["cost"], 100.0 * (1.0 + 0.5 * 2.0), rtol=1e-3)
+
+
+def test_half_filled_blocks_of_a_large_map_count_with_their_sigma_in_the_second_try(
+    tmp_path, small_memory
+):
+    z = rough_ground()
+    sigma = np.full(z.shape, 0.1)
+    # Specks in every block across the way, one row of heights and sigma, one of sigma alone.
+    z[200, ::4] = sigma[200, ::4] = sigma[240, ::4] = np.nan
+    write_map(tmp_path / "m.tif", grid_of(z, sigma_m=sigma))
+    metrics = large_plan(tmp_path / "m.tif", tmp_path / "a")
+    least = least_altitude(tmp_path / "a", z)
+    assert metrics["k_sigma"] > 3 and least >= 5.0 + 0.1 * metrics["k_sigma"] - 1e-3
+
+
+def test_a_sigma_that_lacks_in_every_block_is_still_covered_on_a_large_map(tmp_path, small_memory):
+    z = rough_ground()
+    sigma = np.full(z.shape, 0.1)
+    sigma[::4, ::4] = np.nan
+    write_map(tmp_path / "m.tif", grid_of(z, sigma_m=sigma))
+    reduced = read_reduced(tmp_path / "m.tif")
+    assert reduced.grid.sigma_m is not None and not reduced.loose_has_more
+    np.testing.assert_allclose(reduced.grid.sigma_m, 0.1, rtol=1e-6)
+    # Where a window holds no sigma at all, nothing is proved: it is barred.
+    problem = Problem(reduced.grid)
+    sigma[:200] = np.nan
+    write_map(tmp_path / "half.tif", grid_of(z, sigma_m=sigma))
+    with open_map(tmp_path / "half.tif") as opened:
+        windows = _Windows(opened, FullMap(tmp_path / "half.tif", None, reduced), problem)
+        box = (WEST + 50, NORTH - 100, WEST + 100, NORTH - 50)
+        assert windows.surface(box, 3.0, 0.0).barred.all()
+
+
+def test_a_dry_map_is_planned_large_with_stops_and_replanned(tmp_path, small_memory, monkeypatch):
+    z = rough_ground() + 1000.0
+    write_map(tmp_path / "dry.tif", grid_of(z))
+    assert large_plan(tmp_path / "dry.tif", tmp_path / "a")["solved"]
+    assert least_altitude(tmp_path / "a", z) >= 5.0
+    again = ("--replan", tmp_path / "a" / "route.csv", "--travelled", 440)
+    for most in (90_000, 1_000_000):
+        monkeypatch.setattr("planning.large.MOST_CELLS", most)
+        result = run("--map", tmp_path / "dry.tif", "--region-weights", "none", *again, "--out", tmp_path / "b")  # fmt: skip
+        assert result.exception is None, result.exception
+    result = run(
+        "--map", tmp_path / "dry.tif", "--start", position(20, 30), "--goal", position(60, 80),
+        "--via", position(30, 70), "--out", tmp_path / "c", "--region-weights", "none",
+        "--planner", "none", "--no-picture",
+    )  # fmt: skip
+    assert result.exception is None, result.exception
+
+
+def test_land_above_a_sea_map_is_no_dry_map_where_only_a_window_is_read(tmp_path):
+    z = np.full((60, 60), 20.0)
+    write_map(tmp_path / "dry.tif", grid_of(z))
+    assert is_dry(tmp_path / "dry.tif")
+    z[-1, -1] = -3.0
+    write_map(tmp_path / "sea.tif", grid_of(z))
+    assert not is_dry(tmp_path / "sea.tif")
+
+
+def test_a_position_sigma_of_a_part_serves_all_windows_of_a_large_map(tmp_path, small_memory):
+    z = rough_ground()
+    write_map(tmp_path / "m.tif", grid_of(z))
+    part = grid_of(np.full((60, 60), 0.5))
+    write_bands(tmp_path / "part.tif", {"sigma_mean": part.elevation_m}, part)
+    errors = ("--position-sigma", tmp_path / "part.tif")
+    assert large_plan(tmp_path / "m.tif", tmp_path / "a", *errors)["k_sigma"] > 3
+    on = position_sigma(tmp_path / "part.tif", tmp_path / "m.tif")
+    np.testing.assert_array_equal(on(replace(part, west_m=WEST + 300)), 0.5)
+    far = replace(part, west_m=WEST + 900)
+    write_bands(tmp_path / "far.tif", {"sigma_mean": part.elevation_m}, far)
+    with pytest.raises(NoOverlapError, match="does not cover the map"):
+        position_sigma(tmp_path / "far.tif", tmp_path / "m.tif")
