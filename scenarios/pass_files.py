@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -21,11 +20,10 @@ from mapping.tile_plan import StripFile
 from perception.files import whole_file, write_text
 from perception.objects import ObjectTable
 from perception.readers import Survey
-from perception.records import ElevationStrip, FloatArray, InputError, Progress, silent
+from perception.records import ElevationStrip, FloatArray, Progress, silent
 from perception.strip_files import read_strip, write_strip
 from perception.strips import PassResult, StripConfig, build_strip
-
-logger = logging.getLogger(__name__)
+from scenarios.passes import each_pass
 
 # Registration compares strips on this part of its cell; finer columns stay on disk.
 _THIN = 0.6
@@ -64,31 +62,27 @@ def file_passes(
     ----------
     identity : what tells this survey from another; a pass that was filed under it is not made again.
 
-    Raises
-    ------
-    InputError
-        No pass gives a strip; single ones that do not are left out with a warning.
+    Errors are those of `each_pass`.
     """
-    filed_passes: list[FiledPass] = []
-    refused: list[str] = []
-    for index in range(survey.n_passes):
-        progress("echoes to strips", index, survey.n_passes)
-        key = hashlib.blake2b(repr((identity, config, index)).encode(), digest_size=16).hexdigest()
-        path = folder / f"strip-{index:03d}.nc"
-        kept = _taken_up(path, key)
-        if kept is None:
-            try:
-                result = build_strip(survey.swath(index), config)
-            except InputError as error:
-                refused.append(str(error))
-                logger.warning("%s; left out", error)
-                continue
-            kept = _written(result, path, key, survey.utc)
-        filed_passes.append(kept)
-    progress("echoes to strips", survey.n_passes, survey.n_passes)
-    if not filed_passes:
-        raise InputError(refused[0] if refused else "the survey holds no pass to make a strip of")
-    return filed_passes
+
+    def key_of(index: int) -> str:
+        text = repr((identity, config, index))
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+    def path_of(index: int) -> Path:
+        return folder / f"strip-{index:03d}.nc"
+
+    def taken_up_or_built(index: int) -> FiledPass | PassResult:
+        kept = _taken_up(path_of(index), key_of(index))
+        return build_strip(survey.swath(index), config) if kept is None else kept
+
+    # Written outside `each_pass`: a full disk is no pass to leave out.
+    return [
+        made
+        if isinstance(made, FiledPass)
+        else _written(made, path_of(index), key_of(index), survey.utc)
+        for index, made in each_pass(survey, taken_up_or_built, progress)
+    ]
 
 
 def _written(result: PassResult, path: Path, key: str, utc: bool) -> FiledPass:
