@@ -93,6 +93,7 @@ def _simulated(geometry: str, terrain: str) -> Simulation:
 
 def looks_of(simulation: Simulation) -> list[Look]:
     """Return the survey's lines as looks, at their true poses with a bottom track of the echoes."""
+    from perception.attitude import levelled
     from perception.bottom import track_bottom
 
     pinged, config = simulation.survey, simulation.scenario.sonar
@@ -113,7 +114,11 @@ def looks_of(simulation: Simulation) -> list[Look]:
         )  # fmt: skip
         bottom = track_bottom(np.square(port), np.square(starboard), sample_m)
         looks.append(
-            Look(swath, np.where(bottom.valid, bottom.first_return_m, np.nan), bottom.sigma_m)
+            Look(
+                levelled(swath, bottom.first_return_m)[0],
+                np.where(bottom.valid, bottom.first_return_m, np.nan),
+                bottom.sigma_m,
+            )
         )
     return looks
 

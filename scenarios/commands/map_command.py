@@ -150,6 +150,8 @@ def command(
             _refuse_bottom(bottom)
             metrics = _in_tiles(out, survey, absolute, cell, tiling, old, fill_m, progress)
         else:
+            if not quiet:
+                _tell_unused(tiling)
             metrics = _in_one_piece(
                 out, survey, absolute, cell, method, old, fill_m, given, progress
             )
@@ -169,11 +171,10 @@ def command(
 def _check_formats(also: tuple[str, ...]) -> None:
     """Refuse a format before any work is done."""
     from mapping.exports import FORMATS
-    from perception.records import InputError
 
     for name in also:
         if Path(name).suffix not in FORMATS or Path(name).name != name:
-            raise InputError(
+            raise click.UsageError(
                 f"--also {name}: give a file's name (no folder) that ends in {', '.join(FORMATS)}"
             )
 
@@ -212,6 +213,22 @@ def _choose(
             err=True,
         )
     return "shadow", True
+
+
+def _tell_unused(tiling: _Tiling) -> None:
+    """Say which options a map in one piece has no use for."""
+    source = click.get_current_context().get_parameter_source("tile_cells")
+    given = {
+        "--scheduler": tiling.scheduler is not None,
+        "--workers": tiling.workers is not None,
+        "--tile-cells": source is click.core.ParameterSource.COMMANDLINE,
+    }
+    unused = [name for name, used in given.items() if used]
+    if unused:
+        click.echo(
+            f"note: {', '.join(unused)}: of no effect, the map is made in one piece; give --tiles",
+            err=True,
+        )
 
 
 def _refuse_bottom(bottom: Path | None) -> None:
@@ -289,17 +306,29 @@ def check_fixes(path: Path | None, fixes: list[PositionFix], survey: Survey) -> 
 
     from perception.records import InputError
 
-    if not survey.utc:
+    if not survey.utc and path is not None and _dated(path):
         raise InputError(
-            f"{path}: the survey's clock has no date, so no fix can be placed; leave --fixes out"
+            f"{path}: the survey's clock has no date, so a `time` in UTC cannot be placed; give "
+            "`time_s`, seconds of the survey's clock, or leave --fixes out"
         )
     first, last = np.nanmin(survey.pings.time_s), np.nanmax(survey.pings.time_s)
-    if not any(first - _FIX_REACH_S <= fix.time_s <= last + _FIX_REACH_S for fix in fixes):
-        raise InputError(
-            f"{path}: no fix lies within an hour of the survey "
-            f"({np.datetime64(int(first), 's')} to {np.datetime64(int(last), 's')} UTC); "
-            "is it of another day, or in local time?"
-        )
+    if any(first - _FIX_REACH_S <= fix.time_s <= last + _FIX_REACH_S for fix in fixes):
+        return
+    if survey.utc:
+        span = f"{np.datetime64(int(first), 's')} to {np.datetime64(int(last), 's')} UTC"
+        doubt = "is it of another day, or in local time?"
+    else:
+        span = f"{first:.0f} to {last:.0f} s of its clock, which has no date"
+        doubt = "give `time_s` by that clock"
+    raise InputError(f"{path}: no fix lies within an hour of the survey ({span}); {doubt}")
+
+
+def _dated(path: Path) -> bool:
+    """Return whether any row of a fixes file has its time as a date, as `read_fixes` takes it."""
+    import csv
+
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as stream:
+        return any(row.get("time") for row in csv.DictReader(stream))
 
 
 def _tell(metrics: dict[str, Any], out: Path) -> None:

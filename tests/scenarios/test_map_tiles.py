@@ -166,8 +166,6 @@ def test_a_full_disk_ends_in_one_line_and_leaves_nothing_half_written(
     [
         (("--cell", "1000"), "--cell 1000 m: the survey is"),
         (("--tiles", "--method", "joint"), "joint method knows none"),
-        (("--also", "map.xyz"), "--also map.xyz"),
-        (("--also", "../map.nc"), "no folder"),
         (("--tiles", "--scheduler", "tcp://127.0.0.1:9", "--tile-cells", "16"), "no Dask scheduler"),
     ],
 )  # fmt: skip
@@ -179,12 +177,43 @@ def test_what_cannot_be_is_refused_in_one_line(
     assert outcome.status == 1 and message in outcome.complaint
 
 
+@pytest.mark.parametrize(
+    ("name", "message"), [("map.xyz", "--also map.xyz"), ("../map.nc", "no folder")]
+)
+def test_another_format_that_is_none_is_wrong_usage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, message: str
+) -> None:
+    outcome = run_command(capsys, "map", "survey.xtf", "--out", tmp_path / "o", "--also", name)
+    assert outcome.status == 2 and message in outcome.err
+
+
 @pytest.mark.parametrize("cell", ["nan", "inf", "0", "-1"])
 def test_a_cell_that_is_no_length_is_wrong_usage(
     made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str], cell: str
 ) -> None:
     outcome = run_command(capsys, "map", made.survey, "--out", tmp_path / "o", f"--cell={cell}")
     assert outcome.status == 2 and "--cell" in outcome.err
+
+
+def test_options_without_effect_on_a_map_in_one_piece_are_told(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    from click import Context
+
+    from scenarios.commands.map_command import _tell_unused, _Tiling, command
+
+    with Context(command) as context:
+        command.parse_args(context, ["survey.xtf", "--out", "o", "--workers", "2"])
+        _tell_unused(_Tiling(False, 1024, None, 2))
+        assert "note: --workers: of no effect" in capsys.readouterr().err
+    with Context(command) as context:
+        command.parse_args(context, ["survey.xtf", "--out", "o", "--tile-cells", "64"])
+        _tell_unused(_Tiling(False, 64, "tcp://h:1", None))
+        assert "--scheduler, --tile-cells: of no effect" in capsys.readouterr().err
+    with Context(command) as context:
+        command.parse_args(context, ["survey.xtf", "--out", "o"])
+        _tell_unused(_Tiling(False, 1024, None, None))
+        assert capsys.readouterr().err == ""
 
 
 def test_maps_too_large_for_one_piece_are_made_in_tiles_unasked(

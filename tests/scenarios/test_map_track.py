@@ -20,6 +20,10 @@ import pytest
 from mapping.fixes import read_fixes
 from mapping.graph_files import read_g2o
 from mapping.pose_graph_files import read_graph
+from perception.readers import open_survey
+from perception.records import InputError
+from scenarios.benchmarks.inversion import looks_of
+from scenarios.commands.map_command import check_fixes
 from scenarios.missions.frame import FileFrame
 from scenarios.schema import load_scenario
 from scenarios.simulation import Simulation, simulate
@@ -203,3 +207,40 @@ def test_a_disk_that_fills_up_leaves_no_half_map_and_says_so(
     left = [p.name for p in (tmp_path / "map").iterdir() if ".part" in p.name]
     assert not left
     assert (tmp_path / "map" / "map.tif").read_bytes() == before
+
+
+def test_fixes_by_a_clock_without_date_are_taken_and_dates_refused(
+    simulated: tuple[Simulation, Path], tmp_path: Path
+) -> None:
+    survey = open_survey([simulated[1] / "survey.xtf"])
+    start = float(survey.pings.time_s[0])
+    dateless = replace(survey, utc=False, pings=replace(survey.pings,
+                       time_s=survey.pings.time_s - start))  # fmt: skip
+    path = tmp_path / "fixes.csv"
+
+    def check(header: str, time: str) -> None:
+        path.write_text(f"{header},easting_m,northing_m,sigma_m\n{time},1,2,0.5\n")
+        check_fixes(path, read_fixes(path), dateless)
+
+    check("time_s", "30")
+    with pytest.raises(InputError, match="has no date, so a `time` in UTC"):
+        check("time", "1970-01-01T00:00:30Z")
+    with pytest.raises(InputError, match=r"no fix lies within an hour.*of its clock"):
+        check("time_s", str(start))
+
+
+def test_looks_of_the_inversion_benchmark_hang_level(
+    simulated: tuple[Simulation, Path],
+) -> None:
+    simulation, _ = simulated
+    truth = simulation.survey.truth
+    looks = looks_of(simulation)
+    swath = looks[0].swath
+    own = truth.line == swath.pass_index
+    pitch = truth.pitch_rad[own]
+    assert np.abs(pitch).max() > 0 and not swath.pitch_rad.any()
+    first = looks[0].altitude_m
+    lead = first * np.sin(pitch)
+    at = np.isfinite(first)
+    moved_e = (swath.easting_m - truth.easting_m[own])[at]
+    np.testing.assert_allclose(moved_e, (lead * np.sin(swath.heading_rad))[at], atol=1e-6)
