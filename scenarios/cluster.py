@@ -56,16 +56,15 @@ def open_cluster(
         with client:
             yield client
         return
-    dask.config.set(
-        {
-            # Runs have their own memory limit; Dask's would kill a worker for what its server's child took.
-            "distributed.worker.memory.terminate": False,
-            **(_HELD if hold_memory else {}),
-            # What a worker has to say of its own end is not for the user.
-            "logging.distributed": "critical",
-        }
-    )
+    settings = {
+        # Runs have their own memory limit; Dask's would kill a worker for what its server's child took.
+        "distributed.worker.memory.terminate": False,
+        **(_HELD if hold_memory else {}),
+        # What a worker has to say of its own end is not for the user.
+        "logging.distributed": "critical",
+    }
     with (
+        dask.config.set(settings),
         LocalCluster(
             n_workers=n_workers or os.cpu_count() or 1,
             # numba's workqueue layer aborts a process that enters it from two threads.

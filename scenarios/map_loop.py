@@ -77,6 +77,23 @@ def draft_map(
     return invert(looks, cell_m, quick, crs, progress).grid
 
 
+def check_prior(prior: Grid | None, crs: str, datum: str) -> None:
+    """Refuse a prior map that a survey's map cannot be compared with, before any work is done.
+
+    Parameters
+    ----------
+    prior : None is no prior map.
+    crs, datum : of the survey; empty where it tells none, which fits any.
+
+    Raises
+    ------
+    InputError
+        The prior map is in another coordinate system or datum.
+    """
+    if prior is not None:
+        same_frame(Grid(np.zeros((1, 1)), 0.0, 1.0, 1.0, crs, datum=datum), prior)
+
+
 def tied_to_prior(
     strips: Sequence[ElevationStrip],
     corrected: CorrectedSurvey,

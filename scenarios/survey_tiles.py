@@ -31,6 +31,7 @@ from perception.objects import ObjectTable
 from perception.readers import Survey
 from perception.records import ElevationStrip, Grid, Progress, Trajectory, silent
 from scenarios.cluster import open_cluster
+from scenarios.map_loop import check_prior
 from scenarios.pass_files import FiledPass, file_passes
 from scenarios.survey_map import corrected_objects, identity, navigated_track, whole_track
 
@@ -79,9 +80,11 @@ class TiledSurvey:
             if self.filled is not None:
                 fill = (_thin(self.plan, self.store, layer, step) for layer in FILL_LAYERS)
                 layers = with_fill(layers, *fill)
+        # Each value is of the north-western cell of its square: that cell's centre is the wide cell's.
+        edge_m = 0.5 * (step - 1) * self.plan.cell_m
         return Grid(
-            layers[name].astype(float), self.plan.west_m, self.plan.north_m, step * self.plan.cell_m,
-            self.plan.crs, layers.get("sigma"), datum=self.plan.datum,
+            layers[name].astype(float), self.plan.west_m - edge_m, self.plan.north_m + edge_m,
+            step * self.plan.cell_m, self.plan.crs, layers.get("sigma"), datum=self.plan.datum,
         )  # fmt: skip
 
 
@@ -118,6 +121,7 @@ def map_tiles(
     folder : where strips and tiles are kept; a later call with the same survey and settings goes on there.
     scheduler : address of a Dask cluster that sees `folder`; None starts a local one of `workers`.
     """
+    check_prior(prior, survey.crs, survey.datum)
     if scheduler is not None:
         # A cluster that does not answer is told before the work, not after it.
         with open_cluster(scheduler):
