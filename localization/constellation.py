@@ -35,6 +35,8 @@ _LEAST_SOUNDED = 0.7
 # 1-sigma of a landmark's place, in smoothing scales, and of the logarithms of strength and size; from
 # landmarks of noisy patches against the map's own (docs/terrain-navigation.md).
 _PLACE_SCALES, _STRENGTH_SIGMA, _SIZE_SIGMA = 0.35, 0.35, 0.5
+# Largest number of the two bytes that a packed place and strength have each.
+_WORD = 65_535
 # Probability that a landmark of the patch is not in the map: noise makes some and merges others.
 _MISSED = 0.3
 # A pair votes if its landmarks are so far apart, in scales: nearer, its direction is uncertain.
@@ -77,24 +79,31 @@ class Landmarks:
         return len(self.kind)
 
     def packed(self) -> bytes:
-        """Return the landmarks as eight bytes each: what a vehicle has to carry."""
-        west, south = float(self.easting_m.min()), float(self.northing_m.min())
-        step = 0.1 * self.scale_m
+        """Return the landmarks as eight bytes each: what a vehicle has to carry.
+
+        Places are kept to a tenth of the scale, or on wider maps to what 16 bits tell apart.
+        """
+        west, south, step = 0.0, 0.0, 0.1 * self.scale_m
+        if len(self):
+            west, south = float(self.easting_m.min()), float(self.northing_m.min())
+            extent = max(float(np.ptp(self.easting_m)), float(np.ptp(self.northing_m)))
+            step = max(step, extent / _WORD)
         record = np.zeros(len(self), np.dtype("u2,u2,u1,u1,u2"))
         record["f0"] = np.round((self.easting_m - west) / step)
         record["f1"] = np.round((self.northing_m - south) / step)
         record["f2"] = self.kind
-        record["f3"] = np.round(8 * np.log2(np.maximum(self.size_m / self.scale_m, 0.01)) + 100)
-        record["f4"] = np.round(-2000 * np.log2(np.maximum(self.strength_per_m, 1e-9)))
-        head = np.array([west, south, self.scale_m, self.area_m2])
+        size = 8 * np.log2(np.maximum(self.size_m / self.scale_m, 0.01)) + 100
+        strength = -2000 * np.log2(np.maximum(self.strength_per_m, 1e-9))
+        record["f3"] = np.round(np.clip(size, 0, 255))
+        record["f4"] = np.round(np.clip(strength, 0, _WORD))
+        head = np.array([west, south, step, self.scale_m, self.area_m2])
         return head.tobytes() + record.tobytes()
 
     @classmethod
     def unpacked(cls, data: bytes) -> Landmarks:
         """Read what `packed` wrote."""
-        west, south, scale, area = np.frombuffer(data[:32])
-        record = np.frombuffer(data[32:], np.dtype("u2,u2,u1,u1,u2"))
-        step = 0.1 * scale
+        west, south, step, scale, area = np.frombuffer(data[:40])
+        record = np.frombuffer(data[40:], np.dtype("u2,u2,u1,u1,u2"))
         return cls(
             easting_m=west + step * record["f0"],
             northing_m=south + step * record["f1"],

@@ -22,6 +22,8 @@ from perception.records import BoolArray, FloatArray, IntArray, Progress, Trajec
 
 # A fix every five minutes: their errors share the map's and the biases, more would repeat them.
 _FIX_EVERY_S = 300.0
+# What the navigator says when it takes up a place that does not follow from the one before.
+_BEGAN_AGAIN = ("lost:", "jumped", "later soundings agree on another place")
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +199,7 @@ def _pieces(rows: IntArray, estimates: Sequence[Estimate]) -> list[IntArray]:
 
 
 def _breaks(reason: str) -> bool:
-    return "lost:" in reason or "jumped" in reason
+    return any(words in reason for words in _BEGAN_AGAIN)
 
 
 def _smooth_piece(

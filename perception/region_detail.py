@@ -194,6 +194,12 @@ def tiles(grid: Grid) -> list[Grid]:
         return [grid]
     known = [(float(np.isfinite(t.elevation_m[::8, ::8]).mean()), t) for t in _lattice(grid)]
     best = max(share for share, _ in known)
+    if best == 0:
+        # The thinned look missed what little there is.
+        known = [(float(np.isfinite(t.elevation_m).mean()), t) for _, t in known]
+        best = max(share for share, _ in known)
+        if best == 0:
+            return [grid]
     full = [tile for share, tile in known if share >= 0.8 * best and share > 0]
     # Spread over the map: every so many of the full ones.
     return full[:: max(1, len(full) // _TILES)][:_TILES]

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 from scipy.interpolate import RegularGridInterpolator
 
 from perception.files import existing_file
-from perception.geodesy import convergence
+from perception.geodesy import GEOGRAPHIC, convergence
 from perception.records import FloatArray, Grid, InputError
 from planning.currents import Currents, steady
 
@@ -34,8 +35,9 @@ def read_currents(text: str, grid: Grid) -> Currents:
 
     East and north are true ones, as in all files; they are turned by the map's convergence.
 
-    A NetCDF has the speeds over one-dimensional coordinates, in the map's CRS or in degrees; of further
-    dimensions (time, depth) the first is taken. Unknown cells count as still water.
+    A NetCDF has the speeds over one-dimensional coordinates, in the map's CRS or in degrees (from -180
+    or from 0); of further dimensions (time, depth) the first is taken. A raster may have a CRS of its
+    own. Unknown cells count as still water.
 
     Raises
     ------
@@ -45,18 +47,22 @@ def read_currents(text: str, grid: Grid) -> Currents:
     parts = text.split(",")
     if len(parts) == 2:
         try:
-            return _turned(steady(float(parts[0]), float(parts[1])), grid)
+            speeds = float(parts[0]), float(parts[1])
         except ValueError:
             pass
+        else:
+            if not np.isfinite(speeds).all():
+                raise InputError(f"{text}: is no current; give two numbers in m/s, e.g. 0.2,-0.1")
+            return _turned(steady(*speeds), grid)
     if not Path(text).exists():
         raise InputError(
             f"{text}: is neither EAST,NORTH in m/s nor a file; give e.g. --currents 0.2,-0.1"
         )
     path = existing_file(Path(text))
-    x, y, east, north, degrees = (
+    x, y, east, north, own_crs = (
         _from_netcdf(path) if path.suffix.lower() in (".nc", ".nc4", ".cdf") else _from_raster(path)
     )
-    currents = Currents(_sampler(path, x, y, (east, north), degrees, grid.crs), str(path))
+    currents = Currents(_sampler(path, x, y, (east, north), own_crs, grid.crs), str(path))
     middle = [
         np.array([0.5 * (grid.west_m + grid.east_m)]), np.array([0.5 * (grid.south_m + grid.north_m)])
     ]  # fmt: skip
@@ -92,16 +98,19 @@ def _sampler(
     x: FloatArray,
     y: FloatArray,
     speeds: tuple[FloatArray, FloatArray],
-    degrees: bool,
+    own_crs: str,
     crs: str,
 ) -> Any:
+    own = CRS.from_user_input(own_crs) if own_crs else None
+    degrees = own is not None and own.is_geographic
     if degrees and not crs:
         raise InputError(
             f"{path}: is in degrees, and the map has no CRS; give currents in its metres"
         )
-    transformer = (
-        Transformer.from_crs(CRS.from_user_input(crs), 4326, always_xy=True) if degrees else None
-    )
+    transformer = _transformer(path, crs, own)
+    if degrees and len(x) > 1 and 0 <= 360.0 - (x[-1] - x[0]) < 1.5 * (x[1] - x[0]):
+        # All round the Earth: the last meridian's neighbour is the first.
+        x, speeds = np.append(x, x[0] + 360.0), (_closed(speeds[0]), _closed(speeds[1]))
     flip = np.s_[::-1] if y[0] > y[-1] else np.s_[:]
     # Land is NaN in models of the sea: still water there, rather than none known beside the coast.
     fields = [
@@ -112,13 +121,36 @@ def _sampler(
     def at(easting_m: FloatArray, northing_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         if transformer is not None:
             easting_m, northing_m = transformer.transform(easting_m, northing_m)
+        if degrees:
+            # Files count longitudes from -180 or from 0.
+            easting_m = x.min() + np.mod(easting_m - x.min(), 360.0)
         points = np.column_stack([northing_m, easting_m])
         return fields[0](points), fields[1](points)
 
     return at
 
 
-def _from_raster(path: Path) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, bool]:
+def _closed(speeds: FloatArray) -> FloatArray:
+    return np.concatenate([speeds, speeds[:, :1]], axis=1)
+
+
+def _transformer(path: Path, crs: str, own: CRS | None) -> Transformer | None:
+    """Return what takes the map's coordinates to a file's; None where they are the same."""
+    if own is None or not crs:
+        return None
+    ours = CRS.from_user_input(crs)
+    if ours.equals(own, ignore_axis_order=True):
+        return None
+    try:
+        return Transformer.from_crs(ours, own, always_xy=True)
+    except ProjError as error:
+        raise InputError(
+            f"{path}: its CRS ({own.name}) cannot be reached from the map's ({ours.name}); warp it: "
+            "gdalwarp -t_srs"
+        ) from error
+
+
+def _from_raster(path: Path) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
     import rasterio
 
     try:
@@ -129,17 +161,17 @@ def _from_raster(path: Path) -> tuple[FloatArray, FloatArray, FloatArray, FloatA
                 source.read(band, masked=True).astype(float).filled(np.nan) for band in (1, 2)
             )
             t = source.transform
-            degrees = source.crs is not None and source.crs.is_geographic
+            own_crs = source.crs.to_wkt() if source.crs else ""
             x = t.c + (np.arange(source.width) + 0.5) * t.a
             y = t.f + (np.arange(source.height) + 0.5) * t.e
     except rasterio.errors.RasterioError as error:
         raise InputError(
             f"{path}: is neither EAST,NORTH in m/s nor a file of currents ({error})"
         ) from error
-    return x, y, east, north, degrees
+    return x, y, east, north, own_crs
 
 
-def _from_netcdf(path: Path) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, bool]:
+def _from_netcdf(path: Path) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, str]:
     import xarray
 
     try:
@@ -159,7 +191,7 @@ def _from_netcdf(path: Path) -> tuple[FloatArray, FloatArray, FloatArray, FloatA
             first = {d: 0 for d in field.dims if d not in (x_name, y_name)}
             flat.append(field.isel(first).transpose(y_name, x_name).to_numpy().astype(float))
         x, y = (data[n].to_numpy().astype(float) for n in (x_name, y_name))
-    return x, y, flat[0], flat[1], x_name.startswith("lon")
+    return x, y, flat[0], flat[1], GEOGRAPHIC if x_name.startswith("lon") else ""
 
 
 def _variable(path: Path, data: Any, names: tuple[str, ...]) -> Any:

@@ -15,7 +15,7 @@ from perception.records import BoolArray, FloatArray, IntArray
 from planning.bars import bar_of
 from planning.curve import waypoints
 from planning.field import search
-from planning.polish import RADIUS_RESERVE, Candidate, evaluate, polish, respace, rules_of
+from planning.polish import RADIUS_RESERVE, Candidate, polish, respace, rules_of
 from planning.profile import cone_envelope, make_work, path_cost
 from planning.surface import BAR, BOTTOM, LOWER, WEIGHT, Surface
 
@@ -305,8 +305,3 @@ def _sharpest(points: FloatArray) -> int:
         )
     )
     return int(np.argmax(turn)) + 1
-
-
-def least_breaking(surface: Surface, candidates: list[Candidate]) -> Candidate:
-    """Return the candidate that breaks least, evaluated on the surface."""
-    return min((evaluate(surface, c.points, c.source) for c in candidates), key=lambda c: c.breach)

@@ -52,14 +52,17 @@ def route(run: Run) -> None:
         There is no route within the limits; metrics and picture say why.
     """
     plan, more = _planned(run)
-    write_plan(run.out, plan, run.given, run.config, {**more, "seconds": run.seconds})
+    more["seconds"] = run.seconds
     if run.picture:
         from scenarios.plots_routes import picture_plan
 
         picture_plan(run.out / ("route.png" if plan.solved else "blocked.png"), plan)
+    if plan.route is not None:
+        write_route_files(run.out, plan.route, run.limits)
+    # Last: who finds "solved" finds the route too.
+    write_plan(run.out, plan, run.given, run.config, more)
     if plan.route is None:
         raise NoPathError(f"{run.given.map_path}: no route: {plan.reason}")
-    write_route_files(run.out, plan.route, run.limits)
     if not run.quiet:
         tell_route(plan, run.seconds, run.out)
 
@@ -134,12 +137,12 @@ def survey(run: Run) -> None:
         raise NoPathError(f"{given.map_path}: {reason}; raise the limit or make the area smaller")
     route = route_of(surface, w, problem.grid.crs)
     figured = {**figures(route), "solved": True, "reason": "", **more, "seconds": run.seconds}
-    write_metrics(run.out, figured, run.config, given.seed)
-    write_route_files(run.out, route, run.limits)
     if run.picture:
         from scenarios.plots_routes import picture_survey
 
         picture_survey(run.out / "route.png", surface, found, area)
+    write_route_files(run.out, route, run.limits)
+    write_metrics(run.out, figured, run.config, given.seed)
     if not run.quiet:
         covering = f"{100 * found.covered:.2f} % of {found.area_m2:.0f} m2"
         hours = route.travel_time_s / 3600
@@ -195,8 +198,8 @@ def replanned(run: Run) -> None:
         write_unsolved(run.out, trouble, run.config, given.seed, more)
         raise NoPathError(f"{given.map_path}: no way on: {trouble}; stop or climb")
     figured = {**figures(found), "solved": True, "reason": "", **more}
-    write_metrics(run.out, figured, run.config, given.seed)
     write_route_files(run.out, found, run.limits)
+    write_metrics(run.out, figured, run.config, given.seed)
     if not run.quiet:
         rows = [
             ("length", f"{found.length_m:.1f} m"),

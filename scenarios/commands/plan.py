@@ -129,6 +129,8 @@ def command(out: Path, quiet: bool, verbose: bool, picture: bool, **options: Any
                 route(run)
         except (InputError, NoOverlapError) as error:
             more = {"seconds": time.perf_counter() - began}
+            # Of a route that could not be written whole, nothing is left.
+            clear(out)
             write_unsolved(out, str(error), config, given.seed, more)
             raise
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from localization.witness import Opinion, opinion_of
 from perception.records import FloatArray, Grid
 
 SIDE_M = 3000.0
+_COLUMNS = ("easting_m", "northing_m", "kind", "strength_per_m", "size_m")
 
 
 def strewn(number: int, rng: np.random.Generator) -> Landmarks:
@@ -99,12 +102,28 @@ def test_too_few_landmarks_say_so() -> None:
 def test_a_packed_landmark_takes_eight_bytes_and_comes_back() -> None:
     marks = strewn(500, np.random.default_rng(4))
     data = marks.packed()
-    assert len(data) == 32 + 8 * 500
+    assert len(data) == 40 + 8 * 500
     back = Landmarks.unpacked(data)
     # A tenth of the scale is the step of place; 2^(1/16) and 2^(1/4000) of size and strength.
     np.testing.assert_allclose(back.easting_m, marks.easting_m, atol=1.01)
     np.testing.assert_allclose(back.size_m, marks.size_m, rtol=0.05)
     np.testing.assert_allclose(back.strength_per_m, marks.strength_per_m, rtol=1e-3)
+
+
+def test_packing_keeps_wide_maps_strong_hills_and_none_at_all() -> None:
+    marks = strewn(50, np.random.default_rng(5))
+    wide = replace(
+        marks, easting_m=1000.0 * marks.easting_m, strength_per_m=1e6 * marks.strength_per_m,
+        size_m=1e9 * marks.size_m,
+    )  # fmt: skip
+    back = Landmarks.unpacked(wide.packed())
+    # The step is the extent over what 16 bits count; what no byte holds is held at its end.
+    step = np.ptp(wide.easting_m) / 65_535
+    np.testing.assert_allclose(back.easting_m, wide.easting_m, atol=0.51 * step)
+    assert (back.strength_per_m == 1.0).all() and np.ptp(back.size_m) == 0
+    none = Landmarks.unpacked(replace(marks, **{n: np.zeros(0) for n in _COLUMNS}).packed())
+    assert len(none) == 0 and none.scale_m == 20.0
+    assert "too few" in Constellation(none).match(marks).reason
 
 
 def test_landmarks_of_a_surface_are_its_hills_and_hollows_clear_of_the_border() -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
+
 import navsets
 import numpy as np
 import pytest
 
-from localization.estimate import CONVERGED, LOST
-from localization.mission import Navigation, navigate
+from localization import navigator as navigator_module
+from localization.estimate import CONVERGED, LOST, Estimate
+from localization.mission import _BEGAN_AGAIN, Navigation, _pieces, navigate
 from localization.navfile import nav_table
 from localization.navigator import Navigator
 from localization.terrain import terrain_map
@@ -60,6 +63,17 @@ def test_smoothing_knows_the_start_that_the_causal_filter_could_not() -> None:
         result.smoothed.easting_m[0] - easting[0], result.smoothed.northing_m[0] - northing[0]
     )
     assert start < 4.0 < 10.0 < errors(result, easting, northing)[0]
+
+
+@pytest.mark.parametrize("words", _BEGAN_AGAIN)
+def test_smoothing_does_not_reach_across_a_place_taken_up_anew(words: str) -> None:
+    assert words in inspect.getsource(navigator_module)
+
+    def told(reason: str) -> Estimate:
+        return Estimate(0.0, 0.0, 0.0, np.eye(2), CONVERGED, 1.0, np.zeros(5), np.eye(5), reason)
+
+    rows = [told(reason) for reason in ("", "", f"{words} 40 m", "", "no soundings")]
+    assert [list(piece) for piece in _pieces(np.arange(5), rows)] == [[0, 1], [2, 3, 4]]
 
 
 def test_featureless_ground_gives_no_fix_and_sigma_does_not_shrink() -> None:

@@ -6,6 +6,7 @@ import pytest
 from perception.background import lift_objects
 from perception.records import REGION_CLASSES, Grid, InputError
 from perception.region_classes import classify, three_classes
+from perception.region_detail import tiles
 from perception.region_graph import neighbours
 from perception.region_labels import fold_borders, fold_sums, label_and_sum, region_borders
 from perception.region_merging import join_equal, merge_regions
@@ -289,3 +290,15 @@ def test_a_lifted_boulder_leaves_the_slope_it_stood_on():
     assert (lifted.footprint > 0).sum() == (distance <= 4).sum()
     off_map = lift_objects(grid, np.array([-500.0]), np.array([0.0]), np.array([4.0]))
     assert np.isnan(off_map.height_m[0])
+
+
+def test_a_line_of_heights_across_a_large_empty_map_is_read_as_tiles_or_whole():
+    z = np.full((1000, 1000), np.nan)
+    # Between the cells of the thinned look.
+    z[:, 500:503] = np.linspace(-40, -50, 1000)[:, None]
+    assert len(tiles(grid_of(z))) > 0
+    # And between the tiles themselves, of a map wider than they reach.
+    wide = np.full((300, 4000), np.nan)
+    wide[:, 300:303] = -40.0
+    corners = {t.elevation_m.shape for t in tiles(grid_of(wide))}
+    assert corners == {wide.shape}

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import xarray
 from numpy.testing import assert_allclose
+from pyproj import Transformer
 
-from perception.records import InputError
+from mapping.rasters import write_bands
+from perception.records import Grid, InputError
 from planning.bound import lower_bound
 from planning.cost import CostTerms
 from planning.current_files import read_currents
@@ -118,3 +121,53 @@ def test_a_file_that_holds_no_currents_says_what_is_missing(tmp_path):
         read_currents(str(tmp_path / "t.nc"), grid_of(flat()))
     with pytest.raises(InputError, match="neither EAST,NORTH in m/s nor a file"):
         read_currents("0.1;0.2", grid_of(flat()))
+
+
+@pytest.mark.parametrize("text", ["nan,0", "0.1,inf"])
+def test_a_current_that_is_no_number_is_refused(text):
+    with pytest.raises(InputError, match="is no current"):
+        read_currents(text, grid_of(flat()))
+
+
+@pytest.mark.parametrize("first, last, step", [(0, 359, 1), (350, 358, 0.5), (-180, 179, 1)])
+def test_longitudes_from_nought_reach_west_of_greenwich(tmp_path, first, last, step):
+    # UTM zone 30: its central meridian is 3 degrees west; speeds are the longitude's own.
+    grid = replace(grid_of(flat()), crs="EPSG:32630")
+    lon, lat = np.arange(first, last + step / 2, step), np.linspace(36.0, 38.0, 5)
+    west = np.broadcast_to(np.mod(lon + 180.0, 360.0) - 180.0, (5, len(lon)))
+    xarray.Dataset(
+        {"uo": (("lat", "lon"), 0.0 * west), "vo": (("lat", "lon"), 0.1 * west)},
+        coords={"lat": lat, "lon": lon},
+    ).to_netcdf(tmp_path / "c.nc")
+    assert_allclose(read_currents(str(tmp_path / "c.nc"), grid).on(grid)[1], -0.3, atol=1e-3)
+
+
+def test_longitudes_all_round_join_at_their_seam(tmp_path):
+    # At 0.25 degrees west, between the last meridian of the file and the first.
+    east, north = Transformer.from_crs(4326, 32630, always_xy=True).transform(-0.25, 37.0)
+    grid = Grid(flat(), east - 60, north + 60, 1.0, crs="EPSG:32630")
+    lon, lat = np.arange(0.0, 359.6, 0.5), np.linspace(36.0, 38.0, 5)
+    still = np.zeros((5, len(lon)))
+    still[:, -1] = 0.4
+    xarray.Dataset(
+        {"uo": (("lat", "lon"), still), "vo": (("lat", "lon"), 0 * still)},
+        coords={"lat": lat, "lon": lon},
+    ).to_netcdf(tmp_path / "c.nc")
+    speed = np.hypot(*read_currents(str(tmp_path / "c.nc"), grid).on(grid))
+    assert_allclose(speed, 0.2, atol=2e-3)
+
+
+def test_a_raster_of_currents_is_read_in_its_own_crs(tmp_path):
+    grid = grid_of(flat())
+    east, north = Transformer.from_crs(32632, 32633, always_xy=True).transform(WEST, NORTH)
+    field = Grid(np.zeros((40, 40)), east - 2000.0, north + 2000.0, 100.0, crs="EPSG:32633")
+    # Speeds grow with the other zone's easting.
+    ramp = np.broadcast_to(1e-4 * (field.centres()[0] - east), (40, 40))
+    write_bands(tmp_path / "c.tif", {"east": ramp, "north": 0 * ramp}, field)
+    speed = read_currents(str(tmp_path / "c.tif"), grid).on(grid)[0]
+    assert abs(speed[0, 0]) < 1e-3 and speed[0, -1] == pytest.approx(0.012, abs=1e-3)
+    write_bands(
+        tmp_path / "far.tif", {"east": ramp, "north": 0 * ramp}, replace(field, west_m=WEST)
+    )
+    with pytest.raises(InputError, match="does not reach the map"):
+        read_currents(str(tmp_path / "far.tif"), grid)

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from mapping.rasters import open_map, write_bands, write_map
 from mapping.vectors import write_layer
 from perception.geodesy import convergence
-from perception.records import Grid, NoOverlapError, NoPathError
+from perception.records import Grid, InputError, NoOverlapError, NoPathError
 from planning.full_resolution import FullMap, _Windows
 from planning.large import is_dry, read_reduced
 from planning.problem import Problem
@@ -470,3 +470,17 @@ def test_a_position_sigma_of_a_part_serves_all_windows_of_a_large_map(tmp_path, 
     write_bands(tmp_path / "far.tif", {"sigma_mean": part.elevation_m}, far)
     with pytest.raises(NoOverlapError, match="does not cover the map"):
         position_sigma(tmp_path / "far.tif", tmp_path / "m.tif")
+
+
+def test_metrics_come_after_the_route_and_nothing_is_left_of_one_that_cannot_be_written(
+    chart, tmp_path, monkeypatch
+):
+    def full(out: Path, *more: object) -> None:
+        (out / "route.csv").write_text("half")
+        assert not (out / "metrics.json").exists()
+        raise InputError("disk full")
+
+    monkeypatch.setattr("scenarios.route_runs.write_route_files", full)
+    assert "disk full" in str(plan(chart, tmp_path).exception)
+    assert json.loads((tmp_path / "metrics.json").read_text())["solved"] is False
+    assert not (tmp_path / "route.csv").exists()
