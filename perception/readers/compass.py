@@ -42,29 +42,43 @@ def heading_offsets(
     return np.array(course), np.array(offset)
 
 
-def compass_warning(course_rad: FloatArray, offset_rad: FloatArray) -> str | None:
+def compass_warning(
+    course_rad: FloatArray, offset_rad: FloatArray, declination_deg: float = 0.0
+) -> str | None:
     """Return what is to be told of headings that disagree with the track, or None.
 
     Over several directions ``offset = c + a sin(course) + b cos(course)``: a and b are a current's, c is the
     compass's. Opposite legs suffice for c; in one direction the two cannot be told apart.
+
+    Parameters
+    ----------
+    declination_deg : what install.toml adds to the headings already; the suggested value takes its place.
     """
     if not len(offset_rad):
         return None
+    # About their circular mean offsets do not jump: a compass mounted backwards gives 179 and -179 degrees.
+    mean = float(np.angle(np.exp(1j * offset_rad).mean()))
+    about_mean = np.angle(np.exp(1j * (offset_rad - mean)))
     if abs(np.exp(1j * course_rad).mean()) > _ALIKE:
-        mean = float(np.mean(offset_rad))
         if abs(mean) < _ONE_WAY:
             return None
         return (
             f"headings lie {np.degrees(mean):.0f} deg off the track in the one direction sailed: a "
             "magnetic or turned compass, or a cross current; if the compass, give declination_deg = "
-            f"{-np.degrees(mean):.0f} under [compass] in install.toml"
+            f"{_declination(declination_deg, mean):.0f} under [compass] in install.toml"
         )
     design = np.stack([np.ones(len(course_rad)), np.sin(course_rad), np.cos(course_rad)], axis=1)
-    constant = float(np.linalg.lstsq(design, offset_rad, rcond=1e-3)[0][0])
+    beside_mean = float(np.linalg.lstsq(design, about_mean, rcond=1e-3)[0][0])
+    constant = float(np.angle(np.exp(1j * (mean + beside_mean))))
     if abs(constant) < _CONSTANT:
         return None
     return (
         f"headings lie {np.degrees(constant):.0f} deg off the track on legs of every direction: a "
-        f"magnetic or turned compass; give declination_deg = {-np.degrees(constant):.0f} under [compass] "
-        "in install.toml"
+        f"magnetic or turned compass; give declination_deg = "
+        f"{_declination(declination_deg, constant):.0f} under [compass] in install.toml"
     )
+
+
+def _declination(given_deg: float, error_rad: float) -> float:
+    """Return the declination, in (-180, 180], that takes an error away which was left by the one given."""
+    return 180.0 - (180.0 - given_deg + np.degrees(error_rad)) % 360.0

@@ -129,7 +129,8 @@ class Survey:
         if not any("off the track" in text for text in defects):
             odd = compass_warning(
                 *heading_offsets(table.time_s, table.easting_m, table.northing_m,
-                                 table.heading_rad, table.pass_index)
+                                 table.heading_rad, table.pass_index),
+                0.0 if installation is None else installation.compass.declination_deg,
             )  # fmt: skip
             warnings += [odd] if odd else []
         warnings += _unlike_depths(files, table)

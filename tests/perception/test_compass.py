@@ -39,6 +39,24 @@ def test_one_direction_leaves_both_open_and_small_angles_are_not_told() -> None:
     assert compass_warning(np.zeros(0), np.zeros(0)) is None
 
 
+@pytest.mark.parametrize("legs", [(90, 270, 90, 270), (45, 225, 135, 315), (30, 33, 31, 32)])
+def test_a_compass_mounted_backwards_is_told(legs: tuple[float, ...]) -> None:
+    offset = np.radians([179.0, -179.0, 178.0, -178.0])
+    told = compass_warning(np.radians(legs), offset)
+    assert (
+        told is not None and "180 deg" in told and "declination_deg = " in told and "180 u" in told
+    )
+
+
+def test_the_suggested_declination_takes_the_place_of_the_one_given() -> None:
+    legs, left = np.radians([90.0, 270.0]), np.radians([17.0, 17.0])
+    for given, wanted in ((-20.0, -37), (-170.0, 173), (17.0, 0)):
+        told = compass_warning(legs, left, given)
+        assert told is not None and f"declination_deg = {wanted} under" in told
+    told = compass_warning(np.radians([30.0]), np.radians([-15.0]), 5.0)
+    assert told is not None and "declination_deg = 20 under" in told
+
+
 def test_offsets_come_from_the_passes_alone() -> None:
     time = np.arange(60.0)
     east = np.where(time < 30, 1.5 * time, 45.0)
