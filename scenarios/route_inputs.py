@@ -203,7 +203,7 @@ def position_sigma(path: Path | None, map_path: Path) -> Callable[[Grid], FloatA
     import numpy as np
 
     from mapping.rasters import open_map
-    from planning.large import map_bounds
+    from planning.large import map_bounds, map_crs
 
     with open_map(path) as opened:
         names = [name or "" for name in opened.source.descriptions]
@@ -212,6 +212,7 @@ def position_sigma(path: Path | None, map_path: Path) -> Callable[[Grid], FloatA
         raster = replace(opened, elevation_band=band, down=False).read_whole()
     if np.nanmin(raster.elevation_m) < 0:
         raise InputError(f"{path}: holds a negative error ({np.nanmin(raster.elevation_m):g} m)")
+    _refuse_other_crs(path, raster.crs, map_crs(map_path))
     if not _knows_within(raster, map_bounds(map_path)):
         raise NoOverlapError(f"{path}: does not cover the map; give a raster of the same area")
     worst = np.nanmax(raster.elevation_m)
@@ -222,6 +223,23 @@ def position_sigma(path: Path | None, map_path: Path) -> Callable[[Grid], FloatA
         return np.where(np.isfinite(sampled), sampled, worst)
 
     return on
+
+
+def _refuse_other_crs(path: Path, crs: str, of_map: str) -> None:
+    if not crs or not of_map or crs == of_map:
+        return
+    from pyproj import CRS
+
+    from perception.geodesy import short_name
+
+    ours = CRS.from_user_input(of_map)
+    # A map may name a vertical datum too, which places on it do not depend on.
+    ours = ours.sub_crs_list[0] if ours.is_compound else ours
+    if not ours.equals(CRS.from_user_input(crs), ignore_axis_order=True):
+        raise InputError(
+            f"{path}: lies in {short_name(CRS.from_user_input(crs))}, the map in {short_name(ours)}; warp it: "
+            f"gdalwarp -t_srs {short_name(ours)}"
+        )
 
 
 def _knows_within(raster: Grid, box: tuple[float, float, float, float]) -> bool:

@@ -470,6 +470,10 @@ def test_a_position_sigma_of_a_part_serves_all_windows_of_a_large_map(tmp_path, 
     write_bands(tmp_path / "far.tif", {"sigma_mean": part.elevation_m}, far)
     with pytest.raises(NoOverlapError, match="does not cover the map"):
         position_sigma(tmp_path / "far.tif", tmp_path / "m.tif")
+    other = replace(part, crs="EPSG:32633")
+    write_bands(tmp_path / "other.tif", {"sigma_mean": part.elevation_m}, other)
+    with pytest.raises(InputError, match="EPSG:32633, the map in EPSG:32632"):
+        position_sigma(tmp_path / "other.tif", tmp_path / "m.tif")
 
 
 def test_metrics_come_after_the_route_and_nothing_is_left_of_one_that_cannot_be_written(
