@@ -13,6 +13,8 @@ from mapping.fusion import default_cell as default_fusion_cell
 from mapping.fusion import fuse
 from mapping.keyframes import Keyframes
 from mapping.overlaps import Window
+from mapping.placed import extent
+from mapping.placed import placed as strip_placed
 from mapping.pose_graph import GraphConfig, Link, Solution, perpendicular
 from mapping.registration import Match, match
 from mapping.textures import MatchConfig, Texture, placed_anew, texture
@@ -20,6 +22,9 @@ from perception.records import ElevationStrip, FloatArray, Grid, Progress
 
 # More than two gain little: gathering is short and the rest holds the lock.
 _THREADS = 2
+# Cells of the floor that places echoes: some hundred bytes each while passes are fused. At a sixth of an
+# altitude of 15 m they are 25 km2, and at the width it is smoothed to, 0.4 altitudes, 140 km2.
+_FLOOR_CELLS = 4_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,18 +115,31 @@ def known_floor(strips: Sequence[ElevationStrip]) -> Grid | None:
     if not any(np.isfinite(s.elevation_m).any() for s in strips):
         return None
     altitude = float(np.nanmedian(np.concatenate([s.altitude_m for s in strips])))
-    cell_m = max(default_fusion_cell(strips), altitude / 6.0)
+    cell_m = affordable_cell(strips, max(default_fusion_cell(strips), altitude / 6.0))
     grid = fuse(strips, cell_m)
     weight = np.where(
         np.isfinite(grid.elevation_m),
         1.0 / np.nan_to_num(np.asarray(grid.sigma_m), nan=1.0) ** 2,
         0,
     )
-    width = 0.4 * altitude / cell_m
+    # Half a cell at least: between wide cells that few passes touch there is something to interpolate.
+    width = max(0.4 * altitude / cell_m, 0.5)
     total = gaussian_filter(weight, width)
     mean = gaussian_filter(weight * np.nan_to_num(grid.elevation_m), width)
     height = np.where(total > 0, mean / np.where(total > 0, total, 1.0), np.nan)
     return replace(grid, elevation_m=height)
+
+
+def affordable_cell(
+    strips: Sequence[ElevationStrip], cell_m: float, most: int = _FLOOR_CELLS
+) -> float:
+    """Return `cell_m`, or as wide a cell as the strips' rectangle needs to stay near `most` cells.
+
+    The floor is made anew every round, of the whole survey, whether its map is made in tiles or not.
+    """
+    window = extent([strip_placed(strip) for strip in strips], cell_m)
+    cells = 0 if window is None else window.rows * window.cols
+    return cell_m * max(1.0, float(np.sqrt(cells / most)))
 
 
 def expected_shift(
