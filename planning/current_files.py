@@ -145,8 +145,8 @@ def _transformer(path: Path, crs: str, own: CRS | None) -> Transformer | None:
         return Transformer.from_crs(ours, own, always_xy=True)
     except ProjError as error:
         raise InputError(
-            f"{path}: its CRS ({own.name}) cannot be reached from the map's ({ours.name}); warp it: "
-            "gdalwarp -t_srs"
+            f"{path}: its CRS ({own.name}) cannot be reached from the map's ({ours.name}); "
+            "give currents in the map's metres"
         ) from error
 
 
