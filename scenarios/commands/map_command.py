@@ -122,11 +122,13 @@ def command(
     """
     import time
 
+    from mapping.exports import check_frame
     from mapping.fixes import read_fixes
     from mapping.rasters import read_map
     from perception.bottom_files import read_bottom
     from perception.installation import read_installation
     from perception.readers import open_survey
+    from scenarios.map_loop import check_prior
     from scenarios.outputs import write_metrics
 
     set_verbosity(quiet, verbose)
@@ -144,6 +146,8 @@ def command(
                 click.echo(f"note: {warning}", err=True)
         if absolute:
             check_fixes(fixes, absolute, survey)
+        check_prior(old, survey.crs, survey.datum)
+        check_frame(also, survey.crs)
         tiling = _Tiling(tiles, tile_cells, scheduler, workers)
         method, in_tiles = _choose(survey, cell, method, tiling, quiet)
         if in_tiles:

@@ -9,13 +9,18 @@ import numpy as np
 import pytest
 
 from mapping.gridding import Window
+from mapping.rasters import write_map
 from mapping.tile_plan import TilePlan
 from mapping.tile_store import TileStore
+from perception.readers.netcdf import write_netcdf
 from perception.records import Grid, InputError
 from scenarios import survey_tiles
 from scenarios.cluster import open_cluster
 from scenarios.map_loop import check_prior
 from scenarios.survey_tiles import TiledSurvey
+from tests.perception.echo_fixtures import Survey as Pings
+from tests.perception.echo_fixtures import flat, make_swath
+from tests.scenarios.command_line import run_command
 
 
 def slope(east_m: Any, north_m: Any) -> Any:
@@ -55,6 +60,25 @@ def test_a_prior_map_of_another_frame_is_refused_before_the_work() -> None:
     for crs, datum in (("EPSG:32631", "MSL"), ("", ""), ("EPSG:32631", "")):
         check_prior(prior, crs, datum)
     check_prior(None, "EPSG:32630", "MSL")
+
+
+def test_the_command_refuses_such_a_prior_map_before_any_strip_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*arguments: object, **more: object) -> None:
+        raise AssertionError("a pass was read")
+
+    monkeypatch.setattr("perception.readers.Survey.swath", never)
+    swath = make_swath(flat, Pings(n_pings=80, n_samples=300), np.random.default_rng(0))
+    write_netcdf(tmp_path / "line.nc", swath)
+    prior = Grid(np.zeros((8, 8)), 500_000.0, 5_600_008.0, 1.0, "EPSG:32601", np.ones((8, 8)))
+    write_map(tmp_path / "prior.tif", prior)
+    for more in ((), ("--tiles",)):
+        done = run_command(
+            capsys, "map", tmp_path / "line.nc", "--out", tmp_path / "map", "--prior",
+            tmp_path / "prior.tif", *more,
+        )  # fmt: skip
+        assert done.status == 1 and "different coordinate systems" in done.complaint, done.err
 
 
 def test_a_local_cluster_gives_dask_its_settings_back() -> None:
