@@ -126,13 +126,13 @@ class Survey:
                 "depth is unknown or zero throughout: elevations are relative to the sonar"
             )
         table, n_passes = _split(table, files, config or PassConfig())
-        if not any("off the track" in text for text in defects):
-            odd = compass_warning(
-                *heading_offsets(table.time_s, table.easting_m, table.northing_m,
-                                 table.heading_rad, table.pass_index),
-                0.0 if installation is None else installation.compass.declination_deg,
-            )  # fmt: skip
-            warnings += [odd] if odd else []
+        # Of the headings as install.toml leaves them; what the files say of themselves is a defect apart.
+        odd = compass_warning(
+            *heading_offsets(table.time_s, table.easting_m, table.northing_m,
+                             table.heading_rad, table.pass_index),
+            0.0 if installation is None else installation.compass.declination_deg,
+        )  # fmt: skip
+        warnings += [odd] if odd else []
         warnings += _unlike_depths(files, table)
         return cls(
             crs=target,

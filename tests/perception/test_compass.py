@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from perception.installation import read_installation
 from perception.readers import open_survey
 from perception.readers.compass import compass_warning, heading_offsets
 from perception.readers.netcdf import write_netcdf
@@ -66,6 +67,22 @@ def test_offsets_come_from_the_passes_alone() -> None:
     course, offset = heading_offsets(time, east, north, heading, number)
     assert np.degrees(course) == pytest.approx([90, 0], abs=8)
     assert np.degrees(offset) == pytest.approx([10, 10], abs=2)
+
+
+def test_a_backward_compass_warns_and_its_declination_in_install_toml_ends_that(
+    tmp_path: Path,
+) -> None:
+    swath = make_swath(flat, Survey(n_pings=60, n_samples=300), np.random.default_rng(0))
+    noise = np.random.default_rng(1).normal(0, 0.02, 60)
+    write_netcdf(tmp_path / "a.nc", replace(swath, heading_rad=np.mod(np.pi + noise, 2 * np.pi)))
+    assert any(
+        "180 deg off the track" in text for text in open_survey([tmp_path / "a.nc"]).warnings
+    )
+    (tmp_path / "install.toml").write_text("[compass]\ndeclination_deg = 180\n")
+    mended = open_survey(
+        [tmp_path / "a.nc"], installation=read_installation(tmp_path / "install.toml", None, None)
+    )
+    assert not mended.warnings
 
 
 def test_files_with_and_without_depth_together_are_told(tmp_path: Path) -> None:
