@@ -75,6 +75,7 @@ class State:
     lead_m: FloatArray | float = 0.0
     lead_sigma_m: float = 0.0
     base: FloatArray | None = None
+    first: FloatArray | None = None
     residual: list[float] = field(default_factory=list)
     step_m: list[float] = field(default_factory=list)
 

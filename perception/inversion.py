@@ -196,6 +196,8 @@ def _hand_down(coarse: State, fine: State) -> None:
     fine.albedo = _resample(coarse.albedo, coarse, fine)
     if coarse.base is not None:
         fine.base = _resample(coarse.base, coarse, fine)
+    if coarse.first is not None:
+        fine.first = _resample(coarse.first, coarse, fine)
     fine.gain, fine.roughness = coarse.gain, coarse.roughness
     fine.lead_m, fine.lead_sigma_m = coarse.lead_m, coarse.lead_sigma_m
     # Residuals on other cells do not compare: the fine problem's own decide when it ends.

@@ -6,13 +6,12 @@ import logging
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage, sparse
 
 from perception.first_return import first_return_lead
 from perception.inverse_state import Data, Solved, State, linear_problem, sounding_surface
-from perception.multigrid import Spectrum
 from perception.occlusion import dark_samples, shadow_equations
-from perception.profiles import mean_profiles, one_sided
-from perception.rays import Rays
+from perception.profiles import crossing, mean_profiles, one_sided
 from perception.records import BoolArray, FloatArray, Progress
 from perception.shading import Rows, trace
 from perception.soundings import Equations, both, mean_soundings, sounding_equations
@@ -25,15 +24,20 @@ logger = logging.getLogger(__name__)
 _MOSTLY_ONE_SIDED = 0.85
 
 
-# Part of the ground below a track that other passes' echoes resolve as well as their noise allows: crests hide
-# what lies behind them, and what is hidden keeps the lead of ground unseen.
-_RESOLVED = 0.5
 # Looks from one side rest on a gain that their own ground cannot correct; so much they count.
 _ONE_SIDED_PART = 0.1
 
 
+# Steps about a surface without detail, that settle the mean profiles; 1-sigma of those afterwards.
+_SMOOTH_STEPS = 4
+_PROFILE_M = 0.02
+_LOOSE_PROFILE_M = 0.1
+
+
 def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generator) -> Solved:
     """Relinearise and solve until the surface stands still."""
+    # Two steps at least see the detail.
+    smooth_steps = max(min(_SMOOTH_STEPS, state.config.iterations - 2), 1)
     for k in range(len(state.step_m), len(state.step_m) + steps):
         dark = _dark(state, first=k == 0)
         rows, passed = trace(
@@ -42,7 +46,8 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
         )  # fmt: skip
         if state.lead_sigma_m == 0.0:
             _learn_lead(state, rows, rng)
-        data = _linearise(state, rows, first=k == 0)
+        smooth = k < smooth_steps
+        data = _linearise(state, rows, first=k == 0, smooth=smooth)
         equations = sounding_equations(
             state.surface,
             state.west_m,
@@ -55,6 +60,8 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
         single = one_sided(rows, state.shape)
         held = _held_profiles(state, single, passed)
         held = both(held, mean_soundings(equations, state.soundings))
+        if state.first is not None and not _mostly(single, passed):
+            held = both(held, _first_profiles(state, rows, passed))
         if k > 0 and state.config.shadows:
             equations = both(
                 equations,
@@ -74,13 +81,17 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
         seen[:-1, :-1] = passed & ~single if np.any(passed & ~single) else passed
         step = float(np.sqrt(np.mean((solution[0] - state.surface)[seen] ** 2)))
         state.surface, state.albedo, state.gain = solution
+        if k + 1 == smooth_steps:
+            state.first = state.surface
+        elif smooth and not alone:
+            state.surface = _without_detail(state)
         state.step_m.append(step)
         logger.info(
             "joint inversion: iteration %d, %d data, residual %.3f, step %.3f m, %d solver steps",
             k + 1, len(rows.cell), state.residual[-1], step, used,
         )  # fmt: skip
         progress("joint inversion", k + 2, state.config.iterations + 3)
-        if step < 0.02:
+        if step < 0.02 and not smooth:
             break
     return solved
 
@@ -111,7 +122,7 @@ def _less_of_one_sided(data: Data, single: BoolArray) -> Data:
 
 
 def _held_profiles(state: State, single: BoolArray, lit: BoolArray) -> Equations:
-    """Return the mean profiles that one-sided looks must not change."""
+    """Return the mean profiles of a survey seen from one side: there echoes must not change them."""
     if state.base is None:
         # Once the first returns' lead is known: the surface of the soundings alone.
         state.base = sounding_surface(state)
@@ -120,21 +131,30 @@ def _held_profiles(state: State, single: BoolArray, lit: BoolArray) -> Equations
     frame = (state.base, state.west_m, state.south_m, state.cell_m, state.rays)
     if _mostly(single, lit):
         return mean_profiles(*frame, single, max(0.1 * spread, 0.02))
-    # Means over a line of independent stretches: the longer the line, the less may its profile rise.
-    length = float(np.median([_length(ray) for ray in state.rays]))
-    stretches = max(length / (2 * _correlation_length(state.roughness, length)), 1.0)
-    return mean_profiles(*frame, lit & ~single, spread / np.sqrt(stretches), relative=True)
+    return Equations(sparse.csr_matrix((0, state.surface.size)), np.zeros(0), np.zeros(0))
 
 
-def _length(ray: Rays) -> float:
-    return float(np.hypot(np.ptp(ray.easting_m), np.ptp(ray.northing_m)))
+def _first_profiles(state: State, rows: Rows, lit: BoolArray) -> Equations:
+    """Return the mean profiles across the tracks as the steps about a smooth floor found them.
+
+    About a smooth floor mean slope and mean log power are in proportion. On a rough one the cells that a sonar
+    sees are those that face it, and a profile found there creeps upwards, step by step, at the cost of a gain that
+    nothing contradicts: 0.1 to 0.4 m in five steps on independent simulations. Tracks that cross
+    contradict it, so there the hold is loose.
+    """
+    assert state.first is not None
+    crossed = float(np.sum(crossing(rows, state.shape))) > 0.1 * np.unique(rows.cell).size
+    frame = (state.first, state.west_m, state.south_m, state.cell_m, state.rays)
+    sigma = _LOOSE_PROFILE_M if crossed else _PROFILE_M
+    return mean_profiles(*frame, lit, sigma, relative=True)
 
 
-def _correlation_length(roughness: Spectrum, longest_m: float) -> float:
-    """Return the mean inverse wave number of the heights' variance, of waves that fit a line, metres."""
-    k = np.geomspace(2 * np.pi / longest_m, 10, 400)
-    power = k / (roughness.p0 + roughness.p1 * k**2 + roughness.p2 * k**4)
-    return float(np.trapezoid(power / k, k) / np.trapezoid(power, k))
+def _without_detail(state: State) -> FloatArray:
+    """Return the surface without what is narrower than a third of the altitude."""
+    width_m = float(np.median(state.soundings.range_m)) / 3
+    return np.asarray(
+        ndimage.gaussian_filter(state.surface, width_m / state.cell_m, mode="nearest")
+    )
 
 
 def _learn_lead(state: State, rows: Rows, rng: np.random.Generator) -> None:
@@ -146,7 +166,7 @@ def _learn_lead(state: State, rows: Rows, rng: np.random.Generator) -> None:
     duals = (state.shape[0] - 1) * (state.shape[1] - 1)
     far = np.bincount(rows.cell[rows.ground_m > rows.drop_m], minlength=duals)
     # Two looks tell slope from albedo.
-    seen = _RESOLVED * float(np.mean(np.minimum(far[below], 2))) / 2
+    seen = float(np.mean(np.minimum(far[below], 2))) / 2
     altitude = float(np.median(bottom.range_m))
     lead = spread = 0.0
     for part, resolved in ((seen, True), (1 - seen, False)):
@@ -165,7 +185,7 @@ def _learn_lead(state: State, rows: Rows, rng: np.random.Generator) -> None:
     )
 
 
-def _linearise(state: State, rows: Rows, first: bool) -> Data:
+def _linearise(state: State, rows: Rows, first: bool, smooth: bool) -> Data:
     """Return the data rows about the present surface, robustly weighted."""
     config = state.config
     knot, share = state.basis.place(rows.angle_rad, rows.slant_m, rows.side.astype(np.int64))
@@ -178,8 +198,8 @@ def _linearise(state: State, rows: Rows, first: bool) -> Data:
     residual = rows.ratio - gain - at[3]
     scale = _scale_by_angle(residual, rows.angle_rad)
     # Residuals of the first pass are the relief itself: there the width is given, not measured.
-    sigma = np.full(len(residual), 0.35) if first else np.maximum(scale, config.least_sigma)
-    unit = residual if first else residual / (2.5 * np.maximum(scale, 0.1))
+    sigma = np.full(len(residual), 0.35) if smooth else np.maximum(scale, config.least_sigma)
+    unit = residual if smooth else residual / (2.5 * np.maximum(scale, 0.1))
     weight = rows.share**2 / (1 + unit**2) / sigma**2
     weight[rows.ground_m < config.nadir * rows.drop_m] = 0.0
     lever = np.maximum(rows.ground_m - rows.drop_m * rows.slope, 0.3 * rows.ground_m)
