@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from perception.records import ElevationStrip, FloatArray, Grid
 
@@ -77,6 +77,16 @@ def hold_one_sided(
     sigma = grid.sigma_m
     if sigma is not None and soundings.sigma_m is not None:
         theirs = replace(soundings, elevation_m=soundings.sigma_m).sample(e, n)
-        theirs = np.where(np.isfinite(theirs), theirs, sigma)
+        # Beyond the strips' reach the nearest of them tells how little is known, not the echoes' own sigma.
+        theirs = _nearest_known(theirs, sigma)
         sigma = np.maximum(sigma, part * theirs)
     return replace(grid, elevation_m=held, sigma_m=sigma)
+
+
+def _nearest_known(values: FloatArray, otherwise: FloatArray) -> FloatArray:
+    """Return `values` with NaN replaced by the nearest finite one; `otherwise` where there is none."""
+    known = np.isfinite(values)
+    if not known.any():
+        return otherwise
+    row, col = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.asarray(values[row, col])

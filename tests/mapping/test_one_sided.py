@@ -45,3 +45,14 @@ def test_a_tilt_is_taken_from_the_rim_and_left_between_the_tracks():
     # Detail narrower than the altitude stays.
     assert held.elevation_m[rim].std(axis=0).mean() > 0.12
     assert held.sigma_m[rim].min() > 1.0 and held.sigma_m[middle].max() < 0.2
+
+
+def test_beyond_the_strips_reach_sigma_is_that_of_the_nearest_strip_not_of_the_echoes():
+    heights = np.zeros((120, 60))
+    joint = _grid(heights, 0.1)
+    reached = np.where((80.0 - 0.5 - np.arange(120) < 62)[:, None] & np.ones(60, bool), 0.0, np.nan)
+    soundings = Grid(reached, 0.0, 80.0, 1.0, sigma_m=np.where(np.isfinite(reached), 1.5, np.nan))
+    strips = [_strip(20.0), _strip(40.0, heading_rad=3 * np.pi / 2)]
+    held = hold_one_sided(joint, soundings, strips, altitude_m=8.0)
+    rows = 80.0 - 0.5 - np.arange(120)
+    assert held.sigma_m[(rows > 63) & (rows < 70)].min() > 1.0
