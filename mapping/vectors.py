@@ -14,7 +14,7 @@ import shapely
 from pyproj import CRS, Transformer
 
 from perception.files import existing_file, whole_file
-from perception.records import InputError
+from perception.records import FloatArray, InputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +83,15 @@ def to_lonlat(shapes: npt.NDArray[Any], crs: str) -> npt.NDArray[Any]:
     return moved
 
 
+def _refuse_metres_as_degrees(path: Path, bounds: FloatArray) -> None:
+    """Refuse coordinates that are no degrees though the file says so, as GeoJSON without a crs does."""
+    if np.nanmax(np.abs(bounds[[0, 2]])) > 360 or np.nanmax(np.abs(bounds[[1, 3]])) > 90:
+        raise InputError(
+            f"{path}: coordinates up to {np.nanmax(np.abs(bounds)):.0f} are no degrees, but a GeoJSON without "
+            "a crs is in degrees of WGS84; name its crs, or save it as a GeoPackage"
+        )
+
+
 def read_polygons(path: Path, crs: str) -> list[Any]:
     """Read every polygon of a vector file, reprojected to `crs`."""
     path = existing_file(path)
@@ -95,6 +104,8 @@ def read_polygons(path: Path, crs: str) -> list[Any]:
     shapes = shapely.from_wkb(geometry)
     if crs and meta["crs"] and CRS.from_user_input(meta["crs"]) != CRS.from_user_input(crs):
         transformer = Transformer.from_crs(meta["crs"], crs, always_xy=True)
+        if CRS.from_user_input(meta["crs"]).is_geographic:
+            _refuse_metres_as_degrees(path, shapely.total_bounds(shapes))
         shapes = shapely.transform(
             shapes, lambda c: np.column_stack(transformer.transform(c[:, 0], c[:, 1]))
         )

@@ -187,6 +187,8 @@ def _choose(
     survey: Survey, cell_m: float | None, method: str | None, tiling: _Tiling, quiet: bool
 ) -> tuple[str, bool]:
     """Return the method, and whether the map is made in tiles; refuse cells as large as the survey."""
+    import numpy as np
+
     from perception.records import InputError
     from scenarios.survey_tiles import (
         MOST_CELLS_AT_ONCE,
@@ -200,6 +202,13 @@ def _choose(
         raise InputError(
             f"--cell {cell_m:g} m: the survey is {size_m[0]:.0f} x {size_m[1]:.0f} m, so there would "
             f"be no map to speak of; give {min(size_m) / 40:.2g} or less"
+        )
+    pings = survey.pings
+    sample_m = float(np.median(pings.sample_m[pings.pass_index >= 0]))
+    if cell_m is not None and cell_m < sample_m / 2:
+        raise InputError(
+            f"--cell {cell_m:g} m: the echoes are {sample_m:.2g} m apart, so a map of "
+            f"{size_m[0]:.0f} x {size_m[1]:.0f} m would hold nothing finer; give {sample_m:.2g} or more"
         )
     cells = expected_cells(survey, cell_m, method or "joint")
     most = MOST_CELLS_AT_ONCE if method or cell_m is None else MOST_JOINT_CELLS

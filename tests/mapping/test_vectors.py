@@ -39,3 +39,11 @@ def test_a_file_without_polygons_is_refused(tmp_path: Path) -> None:
     (tmp_path / "noise.gpkg").write_bytes(b"not a geopackage at all")
     with pytest.raises(InputError, match="cannot be read as polygons"):
         read_polygons(tmp_path / "noise.gpkg", CRS)
+
+
+def test_metres_in_a_geojson_without_a_crs_are_not_taken_for_degrees(tmp_path: Path) -> None:
+    feature = {"type": "Feature", "properties": {}, "geometry": json.loads(shapely.to_geojson(BOX))}
+    path = tmp_path / "metres.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    with pytest.raises(InputError, match="no degrees"):
+        read_polygons(path, CRS)

@@ -165,6 +165,7 @@ def test_a_full_disk_ends_in_one_line_and_leaves_nothing_half_written(
     ("arguments", "message"),
     [
         (("--cell", "1000"), "--cell 1000 m: the survey is"),
+        (("--cell", "0.0001"), "the echoes are"),
         (("--tiles", "--method", "joint"), "joint method knows none"),
         (("--tiles", "--scheduler", "tcp://127.0.0.1:9", "--tile-cells", "16"), "no Dask scheduler"),
     ],
