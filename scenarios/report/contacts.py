@@ -69,7 +69,9 @@ def contacts_of(result: PassResult) -> list[Contact]:
 
 
 def pictured(contacts: Sequence[Contact]) -> list[Contact]:
-    """Return the contacts with pictures of the likeliest only: as many as the page will show."""
+    """Return the contacts with pictures of the likeliest only, once twice as many as the page shows have one."""
+    if sum(bool(contact.snippet) for contact in contacts) <= 2 * _MOST:
+        return list(contacts)
     ranked = sorted(range(len(contacts)), key=lambda i: -contacts[i].probability)
     unseen = set(ranked[_MOST:])
     return [

@@ -45,7 +45,8 @@ def test_only_contacts_that_the_page_shows_keep_their_pictures() -> None:
         box(1.0, 15, 10, 0.8, 0.8), Survey(n_pings=80, n_samples=500), np.random.default_rng(5)
     )
     contact = contacts_of(build_strip(swath))[0]
-    many = [replace(contact, probability=i / 1000) for i in range(500)]
+    many = [replace(contact, probability=i / 1000) for i in range(900)]
     kept = pictured(many)
     assert [replace(c, snippet=contact.snippet) for c in kept] == many
-    assert [bool(c.snippet) for c in kept] == [False] * 100 + [True] * 400
+    assert [bool(c.snippet) for c in kept] == [False] * 500 + [True] * 400
+    assert pictured(many[:600]) == many[:600]

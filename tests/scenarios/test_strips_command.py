@@ -120,5 +120,9 @@ def test_a_bottom_edited_by_hand_goes_into_strips_and_map(survey: Path, tmp_path
     assert _run(survey, "--out", tmp_path / "again", *given).returncode == 0
     first, again = (read_strip(tmp_path / name / "strip-000.nc") for name in ("first", "again"))
     assert np.median(first.altitude_m - again.altitude_m) == pytest.approx(1.0, abs=0.05)
+    (tmp_path / "far.csv").write_text("ping,altitude_m\n3,99\n5,10\n")
+    far = _run(survey, "--out", tmp_path / "far", "--bottom", tmp_path / "far.csv")
+    assert far.returncode == 1 and "ping 3 is beyond its range" in far.stderr
+    assert "left out" not in far.stderr
     wrong = _run(survey, "--out", tmp_path / "wrong", "--bottom", tmp_path / "none.csv")
     assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and "none.csv" in wrong.stderr
