@@ -74,7 +74,11 @@ def test_the_polygons_cover_their_cells(folder, result):
 def test_the_levels_are_a_tree_in_one_file(folder, result):
     path = folder / "regions.gpkg"
     names = [name for name, kind in pyogrio.list_layers(path) if kind is not None]
-    assert names == ["regions", "regions-level-2", "graph"]  # the first is what a program reads unasked
+    assert names == [
+        "regions",
+        "regions-level-2",
+        "graph",
+    ]  # the first is what a program reads unasked
     meta, _, _, values = pyogrio.raw.read(path, layer="regions")
     parent = dict(zip(meta["fields"], values, strict=True))["parent"]
     np.testing.assert_array_equal(parent, result.parents[0])
