@@ -205,10 +205,10 @@ def _choose(
         )
     pings = survey.pings
     sample_m = float(np.median(pings.sample_m[pings.pass_index >= 0]))
-    if cell_m is not None and cell_m < sample_m / 2:
+    if cell_m is not None and cell_m < sample_m / 10:
         raise InputError(
             f"--cell {cell_m:g} m: the echoes are {sample_m:.2g} m apart, so a map of "
-            f"{size_m[0]:.0f} x {size_m[1]:.0f} m would hold nothing finer; give {sample_m:.2g} or more"
+            f"{size_m[0]:.0f} x {size_m[1]:.0f} m would hold nothing as fine; give {sample_m:.2g} or more"
         )
     cells = expected_cells(survey, cell_m, method or "joint")
     most = MOST_CELLS_AT_ONCE if method or cell_m is None else MOST_JOINT_CELLS
