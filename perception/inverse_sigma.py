@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from perception.inverse_state import Solved, State, linear_problem
+from perception.inverse_state import Solved, State, linear_problem, present_soundings
 from perception.posterior import Problem
 from perception.records import FloatArray
-from perception.soundings import sounding_equations
 
 # Ground that no two sides see, or that none sees, is known no better than this part of the soundings' sigma: one
 # pass's error was 0.55 to 0.9 of the soundings'.
@@ -24,19 +23,7 @@ def spread(state: State, solved: Solved, rng: np.random.Generator) -> tuple[Floa
     """Return the 1-sigma of the heights, jointly and from the soundings alone, by perturbation."""
     weight = solved.data.weight * state.config.independent
     joint = linear_problem(state, replace(solved.data, weight=weight), solved.equations)
-    alone = linear_problem(
-        state,
-        None,
-        sounding_equations(
-            state.surface,
-            state.west_m,
-            state.south_m,
-            state.cell_m,
-            state.soundings,
-            lead_m=state.lead_m,
-            lead_sigma_m=state.lead_sigma_m,
-        ),
-    )
+    alone = linear_problem(state, None, present_soundings(state))
     return _sample_sigma(joint, state, rng), _sample_sigma(alone, state, rng)
 
 

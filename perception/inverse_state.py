@@ -132,18 +132,17 @@ def _times(spectrum: Spectrum, factor: float) -> Spectrum:
     return Spectrum(factor * spectrum.p0, factor * spectrum.p1, factor * spectrum.p2)
 
 
+def present_soundings(state: State, below: bool = False) -> Equations:
+    """Return the soundings as equations about the present surface, by their lead as known so far."""
+    return sounding_equations(
+        state.surface, state.west_m, state.south_m, state.cell_m, state.soundings,
+        below=below, lead_m=state.lead_m, lead_sigma_m=state.lead_sigma_m,
+    )  # fmt: skip
+
+
 def sounding_surface(state: State) -> FloatArray:
-    equations = sounding_equations(
-        state.surface,
-        state.west_m,
-        state.south_m,
-        state.cell_m,
-        state.soundings,
-        below=True,
-        lead_m=state.lead_m,
-        lead_sigma_m=state.lead_sigma_m,
-    )
-    problem = linear_problem(state, None, equations)
+    """Return the surface of the soundings and the prior alone."""
+    problem = linear_problem(state, None, present_soundings(state, below=True))
     fields = (state.surface, state.albedo, state.gain)
     solution, _ = problem.solve(fields, problem.right_side())
     return solution[0]

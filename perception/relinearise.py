@@ -6,15 +6,22 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-from scipy import ndimage, sparse
+from scipy import ndimage
 
 from perception.first_return import first_return_lead
-from perception.inverse_state import Data, Solved, State, linear_problem, sounding_surface
+from perception.inverse_state import (
+    Data,
+    Solved,
+    State,
+    linear_problem,
+    present_soundings,
+    sounding_surface,
+)
 from perception.occlusion import dark_samples, shadow_equations
 from perception.profiles import crossing, mean_profiles, one_sided
 from perception.records import BoolArray, FloatArray, Progress
 from perception.shading import Rows, trace
-from perception.soundings import Equations, both, mean_soundings, sounding_equations
+from perception.soundings import Equations, both, mean_soundings
 from perception.stencils import dual_features
 
 logger = logging.getLogger(__name__)
@@ -48,20 +55,17 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
             _learn_lead(state, rows, rng)
         smooth = k < smooth_steps
         data = _linearise(state, rows, first=k == 0, smooth=smooth)
-        equations = sounding_equations(
-            state.surface,
-            state.west_m,
-            state.south_m,
-            state.cell_m,
-            state.soundings,
-            lead_m=state.lead_m,
-            lead_sigma_m=state.lead_sigma_m,
-        )
+        equations = present_soundings(state)
         single = one_sided(rows, state.shape)
-        held = _held_profiles(state, single, passed)
-        held = both(held, mean_soundings(equations, state.soundings))
-        if state.first is not None and not _mostly(single, passed):
-            held = both(held, _first_profiles(state, rows, passed))
+        alone = float(np.sum(single)) >= _MOSTLY_ONE_SIDED * float(np.sum(passed))
+        if state.base is None:
+            # Once the first returns' lead is known: the surface of the soundings alone.
+            state.base = sounding_surface(state)
+        held = mean_soundings(equations, state.soundings)
+        if alone:
+            held = both(_sounding_profiles(state, state.base, single), held)
+        elif state.first is not None:
+            held = both(held, _first_profiles(state, state.first, rows, passed))
         if k > 0 and state.config.shadows:
             equations = both(
                 equations,
@@ -70,7 +74,6 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
                 ),
             )
         solved = Solved(_less_of_one_sided(data, single), equations, single, passed)
-        alone = _mostly(single, passed)
         if k > 0 and not alone:
             data = solved.data
         caution = state.config.caution if k > 0 and alone else 0.0
@@ -107,10 +110,6 @@ def _dark(state: State, first: bool) -> list[BoolArray]:
     ]
 
 
-def _mostly(single: BoolArray, lit: BoolArray) -> bool:
-    return float(np.sum(single)) >= _MOSTLY_ONE_SIDED * float(np.sum(lit))
-
-
 def _less_of_one_sided(data: Data, single: BoolArray) -> Data:
     """Return the data with those of one-sided ground weighing less.
 
@@ -121,20 +120,15 @@ def _less_of_one_sided(data: Data, single: BoolArray) -> Data:
     return replace(data, weight=data.weight * part)
 
 
-def _held_profiles(state: State, single: BoolArray, lit: BoolArray) -> Equations:
+def _sounding_profiles(state: State, base: FloatArray, single: BoolArray) -> Equations:
     """Return the mean profiles of a survey seen from one side: there echoes must not change them."""
-    if state.base is None:
-        # Once the first returns' lead is known: the surface of the soundings alone.
-        state.base = sounding_surface(state)
     bottom = state.soundings
     spread = float(np.std(bottom.up_m - bottom.range_m))
-    frame = (state.base, state.west_m, state.south_m, state.cell_m, state.rays)
-    if _mostly(single, lit):
-        return mean_profiles(*frame, single, max(0.1 * spread, 0.02))
-    return Equations(sparse.csr_matrix((0, state.surface.size)), np.zeros(0), np.zeros(0))
+    frame = (base, state.west_m, state.south_m, state.cell_m, state.rays)
+    return mean_profiles(*frame, single, max(0.1 * spread, 0.02))
 
 
-def _first_profiles(state: State, rows: Rows, lit: BoolArray) -> Equations:
+def _first_profiles(state: State, first: FloatArray, rows: Rows, lit: BoolArray) -> Equations:
     """Return the mean profiles across the tracks as the steps about a smooth floor found them.
 
     About a smooth floor mean slope and mean log power are in proportion. On a rough one the cells that a sonar
@@ -142,9 +136,8 @@ def _first_profiles(state: State, rows: Rows, lit: BoolArray) -> Equations:
     nothing contradicts: 0.1 to 0.4 m in five steps on independent simulations. Tracks that cross
     contradict it, so there the hold is loose.
     """
-    assert state.first is not None
     crossed = float(np.sum(crossing(rows, state.shape))) > 0.1 * np.unique(rows.cell).size
-    frame = (state.first, state.west_m, state.south_m, state.cell_m, state.rays)
+    frame = (first, state.west_m, state.south_m, state.cell_m, state.rays)
     sigma = _LOOSE_PROFILE_M if crossed else _PROFILE_M
     return mean_profiles(*frame, lit, sigma, relative=True)
 
