@@ -26,6 +26,19 @@ def dual_features(z, a, cell, out):
 
 
 @njit(cache=True, fastmath=True)
+def _to_corners(i, j, e, n, level, b, out_z, out_a):
+    """Give a dual cell's gradient (e, n), level and albedo part to its four nodes."""
+    out_z[i, j] += level - e - n
+    out_z[i, j + 1] += level + e - n
+    out_z[i + 1, j] += level - e + n
+    out_z[i + 1, j + 1] += level + e + n
+    out_a[i, j] += b
+    out_a[i, j + 1] += b
+    out_a[i + 1, j] += b
+    out_a[i + 1, j + 1] += b
+
+
+@njit(cache=True, fastmath=True)
 def spread_features(q, cell, out_z, out_a):
     """Add the transpose of `dual_features` applied to `q` (4, r, c)."""
     rows, cols = out_z.shape
@@ -35,14 +48,7 @@ def spread_features(q, cell, out_z, out_a):
             n = q[1, i, j] / (2 * cell)
             m = 0.25 * q[2, i, j]
             b = 0.25 * q[3, i, j]
-            out_z[i, j] += m - e - n
-            out_z[i, j + 1] += m + e - n
-            out_z[i + 1, j] += m - e + n
-            out_z[i + 1, j + 1] += m + e + n
-            out_a[i, j] += b
-            out_a[i, j + 1] += b
-            out_a[i + 1, j] += b
-            out_a[i + 1, j + 1] += b
+            _to_corners(i, j, e, n, m, b, out_z, out_a)
 
 
 @njit(cache=True, fastmath=True)
@@ -63,14 +69,7 @@ def apply_data(moments, z, a, cell, out_z, out_a):
             n = (m[1] * f0 + m[4] * f1 + m[5] * f2 + m[6] * f3) / (2 * cell)
             c = 0.25 * (m[2] * f0 + m[5] * f1 + m[7] * f2 + m[8] * f3)
             b = 0.25 * (m[3] * f0 + m[6] * f1 + m[8] * f2 + m[9] * f3)
-            out_z[i, j] += c - e - n
-            out_z[i, j + 1] += c + e - n
-            out_z[i + 1, j] += c - e + n
-            out_z[i + 1, j + 1] += c + e + n
-            out_a[i, j] += b
-            out_a[i, j + 1] += b
-            out_a[i + 1, j] += b
-            out_a[i + 1, j + 1] += b
+            _to_corners(i, j, e, n, c, b, out_z, out_a)
 
 
 @njit(cache=True, fastmath=True)
