@@ -179,4 +179,4 @@ def _print(result: Segmentation, metrics: dict[str, Any], out: Path) -> None:
     )
     rows.append(("seconds", f"{metrics['seconds']:.2f}"))
     print_table(f"regions of {metrics['cells']} cells", rows)
-    print_table("written", [("to", str(out))])
+    click.echo(f"written to {out}")
