@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from localization.hypotheses import Hypothesis, hypotheses
-from localization.kalman import NO_FIT, OUTSIDE, Fit, TerrainKalman
+from localization.kalman import NO_FIT, OUTSIDE, Fit, TerrainKalman, way_of
 from localization.likelihood import shared_between_m2
 from localization.measurements import Soundings
 from localization.terrain import TerrainMap
@@ -64,11 +64,11 @@ class KalmanBank:
         self.way_m += way
         if way > 0:
             self.heading_m = np.array([step_e, step_n]) / way
-        alike = self._alike()
+        ways = {
+            length: way_of(step_e, step_n, length, alike) for length, alike in self._alike().items()
+        }
         for f in self.filters:
-            reach = f.assumed.length_m
-            f.predict(step_e, step_n, seconds, self.tide_m2_s * seconds, alike[reach])
-            f.filter.P[:2, :2] += slip_m2 * np.eye(2)
+            f.predict(ways[f.assumed.length_m], seconds, self.tide_m2_s * seconds, slip_m2)
 
     def shift(self, jump: FloatArray) -> None:
         """Move every offset: the dead-reckoned position jumped."""

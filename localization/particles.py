@@ -60,6 +60,7 @@ class ParticleFilter:
         self.rng = rng
         self.cloud = _empty_cloud(1)
         self.work = np.empty((7, 1), np.float32)
+        self._known: tuple[FloatArray, FloatArray] | None = None
         # On a slope, range noise is horizontal too; the map's rms slope says how much.
         cell = terrain.cell_m
         self.slope = float(np.sqrt(2 * terrain.structure_m2(np.array([cell]))[0])) / cell
@@ -84,26 +85,34 @@ class ParticleFilter:
         bias = mean[4] + (states - mean[:4]) @ slope
         left = max(float(covariance[4, 4] - covariance[:4, 4] @ slope), 1e-6)
         east, north, turn, scale = np.ascontiguousarray(states.T)
-        self.cloud = Cloud(
-            east,
-            north,
-            turn,
-            scale,
-            bias=bias,
-            bias_var=np.full(n, left),
-            log_weight=-0.5 * distance - np.log(proposal),
+        self.take(
+            Cloud(
+                east,
+                north,
+                turn,
+                scale,
+                bias=bias,
+                bias_var=np.full(n, left),
+                log_weight=-0.5 * distance - np.log(proposal),
+            )
         )
+
+    def take(self, cloud: Cloud) -> None:
+        """Take another cloud."""
+        self.cloud = cloud
+        self._known = None
 
     def predict(self, step_e: float, step_n: float, walk_m2: float) -> None:
         """Move every particle by what its scale and heading bias make of a dead-reckoned step."""
-        c = self.cloud
+        c = self._changed()
         noise = self.rng.standard_normal((2, c.count), dtype=np.float32)
         _move(c.east, c.north, c.turn, c.scale, step_e, step_n, np.sqrt(walk_m2), noise)
 
     def shift(self, jump: FloatArray) -> None:
         """Move every offset: the dead-reckoned position jumped."""
-        self.cloud.east += jump[0]
-        self.cloud.north += jump[1]
+        c = self._changed()
+        c.east += jump[0]
+        c.north += jump[1]
 
     def update(
         self, soundings: Soundings, easting_m: float, northing_m: float, step_m: float,
@@ -116,7 +125,7 @@ class ParticleFilter:
         The share of soundings that fit, over all particles: 0 when all are off the map.
         """
         noise = sounding_noise(soundings, self.terrain, self.slope, step_m)
-        c = self.cloud
+        c = self._changed()
         if self.work.shape[1] != c.count:
             self.work = np.empty((7, c.count), np.float32)
         effective, fitting = weigh(
@@ -130,7 +139,7 @@ class ParticleFilter:
 
     def fuse(self, offset_m: FloatArray, covariance_m2: FloatArray) -> None:
         """Weigh the cloud by an outside fix (2,) of the offset; one in twenty may be wrong."""
-        c = self.cloud
+        c = self._changed()
         d = np.stack([c.east - offset_m[0], c.north - offset_m[1]])
         distance = np.einsum("in,ij,jn->n", d, np.linalg.inv(covariance_m2), d)
         c.log_weight += np.log(0.95 * np.exp(-0.5 * distance) + 0.05 * np.exp(-0.5 * 9.0))
@@ -138,11 +147,13 @@ class ParticleFilter:
 
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Mean (5,) and covariance (5, 5) of east, north, turn, scale and depth bias."""
-        c = self.cloud
-        mean, covariance = _moments(
-            c.east, c.north, c.turn, c.scale, c.bias, c.bias_var, c.log_weight
-        )
-        return mean, covariance
+        if self._known is None:
+            c = self.cloud
+            self._known = _moments(
+                c.east, c.north, c.turn, c.scale, c.bias, c.bias_var, c.log_weight
+            )
+        mean, covariance = self._known
+        return mean.copy(), covariance.copy()
 
     def share_within(self, mean: FloatArray, covariance: FloatArray, sigmas: float) -> float:
         """Weight of the particles within an ellipse of the horizontal Gaussian given."""
@@ -151,6 +162,11 @@ class ParticleFilter:
         d = np.stack([c.east - mean[0], c.north - mean[1]])
         distance = np.einsum("in,ij,jn->n", d, np.linalg.inv(covariance[:2, :2]), d)
         return float(weight[distance < sigmas**2].sum() / weight.sum())
+
+    def _changed(self) -> Cloud:
+        """Return the cloud, about to be changed: its moments are no longer known."""
+        self._known = None
+        return self.cloud
 
     def _resample(self) -> None:
         mean, covariance = self.moments()
@@ -172,14 +188,16 @@ class ParticleFilter:
         east, north, turn, scale = _regularise(
             c.east, c.north, c.turn, c.scale, chosen, mean, keep, root, noise
         )
-        self.cloud = Cloud(
-            east,
-            north,
-            turn,
-            scale,
-            bias=c.bias[chosen],
-            bias_var=c.bias_var[chosen],
-            log_weight=np.zeros(n),
+        self.take(
+            Cloud(
+                east,
+                north,
+                turn,
+                scale,
+                bias=c.bias[chosen],
+                bias_var=c.bias_var[chosen],
+                log_weight=np.zeros(n),
+            )
         )
 
 
@@ -271,37 +289,39 @@ def _effective(log_weight, best):  # type: ignore[no-untyped-def]
     return total * total / square
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"})
 def _moments(east, north, turn, scale, bias, bias_var, log_weight):  # type: ignore[no-untyped-def]
-    mean = np.zeros(5)
-    total = 0.0
-    top = log_weight.max()
-    for i in range(east.size):
-        w = np.exp(log_weight[i] - top)
-        total += w
-        mean[0] += w * east[i]
-        mean[1] += w * north[i]
-        mean[2] += w * turn[i]
-        mean[3] += w * scale[i]
-        mean[4] += w * bias[i]
-    mean /= total
-    covariance = np.zeros((5, 5))
-    d = np.empty(5)
-    for i in range(east.size):
-        w = np.exp(log_weight[i] - top) / total
-        d[0] = east[i] - mean[0]
-        d[1] = north[i] - mean[1]
-        d[2] = turn[i] - mean[2]
-        d[3] = scale[i] - mean[3]
-        d[4] = bias[i] - mean[4]
-        for a in range(5):
-            for b in range(a + 1):
-                covariance[a, b] += w * d[a] * d[b]
-        covariance[4, 4] += w * bias_var[i]
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    layers = (east, north, turn, scale, bias)
+    mean = np.empty(5)
     for a in range(5):
-        for b in range(a):
-            covariance[b, a] = covariance[a, b]
+        mean[a] = _dot(weight, layers[a])
+    covariance = np.empty((5, 5))
+    apart = np.empty(east.size)
+    for a in range(5):
+        for i in range(east.size):
+            apart[i] = weight[i] * (layers[a][i] - mean[a])
+        for b in range(a + 1):
+            covariance[a, b] = covariance[b, a] = _dot_less(apart, layers[b], mean[b])
+    covariance[4, 4] += _dot(weight, bias_var)
     return mean, covariance
+
+
+@numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"})
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i]
+    return total
+
+
+@numba.njit(cache=True, fastmath={"contract", "arcp", "reassoc", "nsz"})
+def _dot_less(a, b, mean):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * (b[i] - mean)
+    return total
 
 
 @numba.njit(cache=True)

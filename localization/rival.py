@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 
 from localization.hypotheses import Hypothesis
@@ -129,11 +130,7 @@ def krige(
     covariance : sill, length and power of ``sill exp(-(d / length)^power)``.
     """
     sill, length, power = covariance
-    everywhere = np.concatenate([known_m, places_m])
-    apart = np.hypot(
-        everywhere[:, None, 0] - everywhere[:, 0], everywhere[:, None, 1] - everywhere[:, 1]
-    )
-    c = sill * np.exp(-((apart / length) ** power))
+    c = _correlations(np.concatenate([known_m, places_m]), length, power) * sill
     m = len(known_m)
     # A millionth of the sill keeps smooth covariances (power near 2) from being singular.
     old = c[:m, :m] + np.diag(variances + 1e-6 * sill + 1e-9)
@@ -145,6 +142,18 @@ def krige(
     predicted = mean + weights.T @ (values - mean)
     left = c[m:, m:] - c[m:, :m] @ weights + np.outer(lack, lack) / total
     return predicted, left
+
+
+@numba.njit(cache=True)
+def _correlations(places_m, length_m, power):  # type: ignore[no-untyped-def]
+    """``exp(-(d / length)^power)`` between (n, 2) places, (n, n)."""
+    n = len(places_m)
+    out = np.ones((n, n))
+    for i in range(n):
+        for j in range(i):
+            apart = np.hypot(places_m[i, 0] - places_m[j, 0], places_m[i, 1] - places_m[j, 1])
+            out[i, j] = out[j, i] = np.exp(-((apart / length_m) ** power))
+    return out
 
 
 def fitted_covariance(lags_m: FloatArray, squares_m2: FloatArray) -> tuple[float, float, float]:

@@ -53,9 +53,8 @@ def bring_to(
     navigator: Navigator, arrays: Mapping[str, FloatArray], words: Mapping[str, Any]
 ) -> None:
     """Take the state that `state_of` gave; map, sensors and configuration must be the same."""
-    navigator.search.cloud = Cloud(
-        **{k: arrays[f"cloud_{k}"].copy() for k in asdict(navigator.search.cloud)}
-    )
+    names = asdict(navigator.search.cloud)
+    navigator.search.take(Cloud(**{k: arrays[f"cloud_{k}"].copy() for k in names}))
     navigator.search.rng.bit_generator.state = words["rng"]
     for name in _PLAIN_STATE:
         setattr(navigator, name, words[name])

@@ -8,11 +8,12 @@ field sampled at the cells' centres plus an error.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from scipy import ndimage
+from scipy import fft, ndimage
 
-from perception.records import FloatArray, Grid
+from perception.records import FloatArray, Grid, IntArray
 
 # Beams of the sensor sets, degrees: azimuth clockwise from the bow, and off nadir. The goals' sonar is
 # `dvl`.
@@ -84,17 +85,47 @@ class Floor:
             self.coefficients, at, order=3, mode="grid-wrap", prefilter=False
         )
 
+    def raster_m(self, cell_m: float, number: int) -> FloatArray:
+        """Depth at the centres of `number` x `number` cells, rows from south to north.
+
+        The same splines as `depth_m`; where the centres repeat the spline's own steps all of them have
+        the same four weights an axis.
+        """
+        first, every = 0.5 * cell_m / self.step_m, cell_m / self.step_m
+        if not float(every).is_integer():
+            centres = (np.arange(number) + 0.5) * cell_m
+            return self.depth_m(*np.meshgrid(centres, centres))
+        knot = int(np.floor(first))
+        t = first - knot
+        weights = np.array(
+            [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]
+        )
+        at = (knot + round(every) * np.arange(number))[:, None] + np.arange(-1, 3)
+        out: FloatArray = self.coefficients
+        for axis in (0, 1):
+            size = out.shape[axis]
+            out = sum(
+                w / 6 * np.take(out, at[:, k] % size, axis) for k, w in enumerate(weights) if w
+            )
+        return out
+
 
 def spectral_floor(config: SetConfig, rng: np.random.Generator) -> Floor:
     """Draw a periodic fractal floor of standard deviation `relief_m`, 100 m deep on average."""
     step_m = config.cell_m / 2
     n = round(config.extent_m / step_m)
-    k = np.hypot(np.fft.fftfreq(n, step_m)[:, None], np.fft.rfftfreq(n, step_m)[None, :])
-    amplitude = (k**2 + config.outer_m**-2) ** (-(config.hurst + 1) / 2)
-    amplitude[0, 0] = 0.0
-    field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((n, n))) * amplitude, s=(n, n))
+    amplitude = _amplitude(n, step_m, config.outer_m, config.hurst)
+    field = fft.irfft2(fft.rfft2(rng.standard_normal((n, n))) * amplitude, s=(n, n))
     field = 100.0 + config.relief_m * (field / field.std())
     return Floor(ndimage.spline_filter(field, order=3, mode="grid-wrap"), step_m)
+
+
+@lru_cache(maxsize=16)
+def _amplitude(n: int, step_m: float, outer_m: float, hurst: float) -> FloatArray:
+    k = np.hypot(np.fft.fftfreq(n, step_m)[:, None], np.fft.rfftfreq(n, step_m)[None, :])
+    amplitude: FloatArray = (k**2 + outer_m**-2) ** (-(hurst + 1) / 2)
+    amplitude[0, 0] = 0.0
+    return amplitude
 
 
 def surface_floor(depth_m: FloatArray, step_m: float) -> Floor:
@@ -105,15 +136,13 @@ def surface_floor(depth_m: FloatArray, step_m: float) -> Floor:
 def prior_map(floor: Floor, config: SetConfig, rng: np.random.Generator) -> Grid:
     """Sample the floor at the cells' centres and add the map's error."""
     n = round(config.extent_m / config.cell_m)
-    centres = (np.arange(n) + 0.5) * config.cell_m
-    easting, northing = np.meshgrid(centres, centres[::-1])
     error = rng.standard_normal((n, n))
     if config.error_length_m > 0:
         # A Gaussian kernel of width s gives a Gaussian correlation of length s * sqrt(2).
         width = config.error_length_m / config.cell_m / np.sqrt(2)
         error = ndimage.gaussian_filter(error, width, mode="wrap")
         error /= error.std()
-    elevation = -floor.depth_m(easting, northing) + config.map_error_m * error
+    elevation = config.map_error_m * error - floor.raster_m(config.cell_m, n)[::-1]
     return Grid(
         elevation_m=elevation,
         west_m=0.0,
@@ -153,25 +182,28 @@ def cast(
     ray : (n, 3) unit vectors east, north, down.
     """
 
-    def above(distance_m: FloatArray) -> FloatArray:
+    def above(distance_m: FloatArray | float, which: IntArray) -> FloatArray:
         return floor.depth_m(
-            easting_m + distance_m * ray[:, 0], northing_m + distance_m * ray[:, 1]
-        ) - (depth_m + distance_m * ray[:, 2])
+            easting_m[which] + distance_m * ray[which, 0],
+            northing_m[which] + distance_m * ray[which, 1],
+        ) - (depth_m[which] + distance_m * ray[which, 2])
 
     step = 2.0
     far = np.full(len(easting_m), np.nan)
+    todo = np.arange(len(easting_m))
     for distance in np.arange(step, 400.0, step):
-        todo = np.isnan(far)
-        if not todo.any():
+        hit = above(distance, todo) <= 0
+        far[todo[hit]] = distance
+        todo = todo[~hit]
+        if not len(todo):
             break
-        hit = todo & (above(np.full(len(far), distance)) <= 0)
-        far[hit] = distance
     low, high = far - step, far.copy()
+    met = np.flatnonzero(np.isfinite(far))
     for _ in range(14):
-        middle = (low + high) / 2
-        under = above(middle) <= 0
-        high = np.where(under, middle, high)
-        low = np.where(under, low, middle)
+        middle = (low[met] + high[met]) / 2
+        under = above(middle, met) <= 0
+        high[met] = np.where(under, middle, high[met])
+        low[met] = np.where(under, low[met], middle)
     return (low + high) / 2
 
 
