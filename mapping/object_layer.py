@@ -1,4 +1,4 @@
-"""Object layers for segmentation: read from objects.gpkg or objects.csv, written with what was lifted."""
+"""Object layers, for segmentation and planning: read from objects.gpkg or .csv, written with what was lifted."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pyproj import CRS, Transformer
 from mapping.vectors import write_layer
 from perception.background import Lifted
 from perception.files import existing_file
-from perception.records import FloatArray, Grid, InputError, RegionMap
+from perception.records import BoolArray, FloatArray, Grid, InputError, RegionMap
 
 # Names under which a footprint's radius is found, and its width, which is halved.
 _RADIUS = ("radius_m", "footprint_radius_m")
@@ -25,12 +25,25 @@ _WIDTH = ("width_m", "footprint_m", "diameter_m")
 
 @dataclass(frozen=True, slots=True)
 class ObjectLayer:
-    """Points with height and footprint, (n,) each, in the CRS of the map they were read for."""
+    """Points with height and footprint, (n,) each, in the CRS of the map they were read for.
+
+    Attributes
+    ----------
+    height_m : height, or a crater's depth, positive; NaN where the file has none.
+    radius_m : of the footprint.
+    crater : True for craters; what has no `kind` counts as standing up.
+    sigma_m, position_sigma_m : 1-sigma of height and of place per axis; 0 where the file has none.
+    least : True where the height is only the least that an open shadow proves.
+    """
 
     easting_m: FloatArray
     northing_m: FloatArray
     height_m: FloatArray
     radius_m: FloatArray
+    crater: BoolArray
+    sigma_m: FloatArray
+    position_sigma_m: FloatArray
+    least: BoolArray
 
 
 def read_objects(path: Path, grid: Grid) -> ObjectLayer:
@@ -61,7 +74,14 @@ def read_objects(path: Path, grid: Grid) -> ObjectLayer:
                 radius_m = share * _numbers(path, columns, name, len(east))
     radius_m = np.where(radius_m > 0, radius_m, height_m)
     radius_m = np.maximum(np.where(np.isfinite(radius_m), radius_m, 0.0), 2 * cell_m)
-    return ObjectLayer(east, north, height_m, radius_m)
+    sigma_m, position_sigma_m = (
+        np.nan_to_num(_numbers(path, columns, name, len(east)))
+        for name in ("sigma_m", "position_sigma_m")
+    )
+    return ObjectLayer(
+        east, north, height_m, radius_m, _holds(columns, "kind", "crater", len(east)),
+        sigma_m, position_sigma_m, _holds(columns, "bound", "lower", len(east)),
+    )  # fmt: skip
 
 
 def _positions(
@@ -98,6 +118,12 @@ def _numbers(path: Path, columns: Mapping[str, Any], name: str, n: int) -> Float
         return np.array([float(v) if v not in ("", None) else np.nan for v in columns[name]])
     except ValueError as error:
         raise InputError(f"{path}: column {name}: {error}; mend or remove the row") from error
+
+
+def _holds(columns: Mapping[str, Any], name: str, word: str, n: int) -> BoolArray:
+    if name not in columns:
+        return np.zeros(n, bool)
+    return np.array([value == word for value in columns[name]], dtype=bool)
 
 
 def write_lifted(path: Path, objects: ObjectLayer, lifted: Lifted, regions: RegionMap) -> None:

@@ -21,6 +21,7 @@ from perception.records import BoolArray, FloatArray, Grid, InputError
 from planning.finish import Waypoints, prove, travel_time_s, water_along
 from planning.ground import SurfaceGround, WindowedGround
 from planning.large import Reduced, window_of
+from planning.obstacles import Obstacles
 from planning.planner import Plan, PlanConfig, plan_on_surface, solve
 from planning.problem import Problem
 from planning.route import Route
@@ -45,6 +46,7 @@ class FullMap:
     reduced: Reduced
     forbidden: Callable[[Grid], BoolArray | None] = lambda grid: None
     position_sigma: Callable[[Grid], FloatArray | None] = lambda grid: None
+    obstacles: Callable[[Grid], Obstacles | None] = lambda grid: None
 
 
 def stretches(easting_m: FloatArray, northing_m: FloatArray, most_m: float) -> list[slice]:
@@ -139,7 +141,7 @@ class _Windows:
             grid = replace(grid, elevation_m=np.full(grid.shape, np.nan))
         problem = replace(
             self.problem, grid=grid, weight=self._weights(grid), forbidden=self.full.forbidden(grid),
-            position_sigma_m=self.full.position_sigma(grid),
+            position_sigma_m=self.full.position_sigma(grid), obstacles=self.full.obstacles(grid),
         )  # fmt: skip
         return problem.surface(problem.clearance_sigma_m(), k)
 

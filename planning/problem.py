@@ -11,6 +11,7 @@ from perception.records import BoolArray, FloatArray, Grid
 from planning.cost import CostTerms
 from planning.currents import Currents
 from planning.limits import VehicleLimits
+from planning.obstacles import Obstacles
 from planning.risk import clearance_factor, clearance_sigma, patches_crossed
 from planning.surface import Surface, build_surface
 
@@ -31,6 +32,7 @@ class Problem:
     risk : probability that the floor is broken anywhere along the route.
     correlation_m : distance over which the map's errors are independent; NaN 10 cells.
     submerged : whether height 0 is the water's surface; None asks the grid (`under_water`).
+    obstacles : objects that stand higher than the map; None none.
     """
 
     grid: Grid
@@ -43,6 +45,7 @@ class Problem:
     risk: float = 0.01
     correlation_m: float = math.nan
     submerged: bool | None = None
+    obstacles: Obstacles | None = None
 
     def under_water(self) -> bool:
         """Tell whether height 0 is the water's surface, which no route may leave.
@@ -78,7 +81,7 @@ class Problem:
             weight = dear + (1.0 if weight is None else weight)
         return build_surface(
             self.grid, self.limits, self.terms, weight, sigma_m, k, self.forbidden,
-            self.under_water(), self.currents,
+            self.under_water(), self.currents, self.obstacles,
         )  # fmt: skip
 
     def surface_for(self, length_m: float) -> tuple[Surface, float]:

@@ -15,6 +15,7 @@ from perception.records import BoolArray, FloatArray, Grid
 from planning.cost import CostTerms
 from planning.currents import STRONGEST, Currents
 from planning.limits import VehicleLimits
+from planning.obstacles import Obstacles, raised
 
 # Layers of `Surface.stack`; the last two are there only where there is a current: its share of the
 # vehicle's speed along local x (east) and y (south).
@@ -28,7 +29,8 @@ class Surface:
     Attributes
     ----------
     bottom_m : (rows, cols) sea floor as stored, NaN no data.
-    lower_m : (rows, cols) least height of the vehicle: bottom + floor + k sigma; NaN no data.
+    lower_m : (rows, cols) least height of the vehicle: bottom (or the top of an object there) + floor
+        + k sigma; NaN no data.
     barred : (rows, cols) True where no route may pass: no data, no-go area, or no water left between
         floor and surface.
     stack : (rows, cols, 4 or 6) float32 layers lower, bottom, weight, bar, drift: filled from the nearest
@@ -108,6 +110,7 @@ def build_surface(
     forbidden: BoolArray | None = None,
     submerged: bool = True,
     currents: Currents | None = None,
+    obstacles: Obstacles | None = None,
 ) -> Surface:
     """Make the planners' rasters from a map.
 
@@ -118,11 +121,14 @@ def build_surface(
     forbidden : (rows, cols) True in no-go areas.
     submerged : whether height 0 is the water's surface, which no route may leave.
     currents : of the water; None still.
+    obstacles : objects that stand higher than the map; None none.
     """
     bottom = np.asarray(grid.elevation_m, float)
-    lower = bottom + limits.floor_m
+    lower: FloatArray = bottom + limits.floor_m
     if sigma_m is not None and k > 0:
         lower = lower + k * sigma_m
+    if obstacles is not None:
+        lower = raised(lower, obstacles, limits.floor_m, sigma_m, k)
     top = 0.0 if submerged else np.inf
     with np.errstate(invalid="ignore"):
         barred = ~np.isfinite(lower) | (lower > top)

@@ -87,6 +87,7 @@ def _plan_line(scenario: Scenario, out: Path) -> tuple[str, ...]:
     line = ["plan", "--map", str(out / "map" / "map.tif")]
     line += ["--start", place(plan.start), "--goal", place(plan.goal)]
     line += ["--vehicle", str(out / "vehicle.toml"), "--risk", repr(plan.risk)]
+    line += ["--objects", str(out / "map" / "objects.gpkg")]
     if plan.weights == "none":
         line += ["--region-weights", "none"]
     else:

@@ -10,16 +10,18 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.colors import LightSource
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LightSource, Normalize
 from matplotlib.patheffects import withStroke
 
 from perception.files import whole_file
-from perception.records import FloatArray
+from perception.records import FloatArray, bilinear
 from planning.coverage import Survey
 from planning.failure import Blockage
 from planning.planner import Plan
 from planning.route import Route
 from planning.surface import Surface
+from scenarios.route_outputs import clearance_told
 
 # Pixels along the longer side of the map; a larger map is thinned.
 _PIXELS = 900
@@ -50,7 +52,7 @@ def _picture_route(path: Path, plan: Plan, route: Route) -> None:
             path_effects=_OUTLINED,
         )  # fmt: skip
     upper.plot(route.easting_m, route.northing_m, color="crimson", lw=1.6, label="route")
-    upper.plot(*route.worst[:2], "o", mfc="none", mec="gold", ms=9, mew=2, label="least margin")
+    upper.plot(*route.worst[:2], "o", mfc="none", mec="gold", ms=9, mew=2, label="least clearance")
     upper.plot(
         route.easting_m[0], route.northing_m[0], "^", color="white", mec="black", label="start"
     )
@@ -69,14 +71,20 @@ def _picture_route(path: Path, plan: Plan, route: Route) -> None:
     bottom = z - route.altitude_m
     limits = surface.limits
     _draw_profile(lower, s, bottom, z, limits.floor_m, limits.ceiling_m)
+    row, col = (local / size for local, size in zip(
+        reversed(surface.local(route.easting_m, route.northing_m)), reversed(surface.cell_m), strict=True
+    ))  # fmt: skip
+    lower.fill_between(
+        s, bottom + limits.floor_m, bilinear(surface.lower_m, row, col), color="orange", alpha=0.5,
+        lw=0, label=f"kept clear besides: {plan.k:.2f} sigma, objects",
+    )  # fmt: skip
     _legends(figure, upper, lower)
     at = int(
         np.argmin(np.hypot(route.easting_m - route.worst[0], route.northing_m - route.worst[1]))
     )
     lower.plot(s[at], -route.worst[2], "o", mfc="none", mec="goldenrod", ms=9, mew=2)
-    over = f"{limits.floor_m:g} m" + (f" + {plan.k:.2f} sigma" if plan.k > 0 else "")
     lower.set_title(
-        f"least margin {route.min_clearance_margin_m:.3f} m over {over} (circle); "
+        f"{clearance_told(route, limits.floor_m, plan.k)} (circle); "
         f"least slant distance to the ground {route.min_stand_off_m:.2f} m",
         fontsize=8,
     )
@@ -176,6 +184,8 @@ def _draw_map(axes: Any, surface: Surface, box: tuple[int, ...]) -> None:
         extent=(west, west + cols * width, north - rows * height, north),
         interpolation="nearest",
     )
+    scale = ScalarMappable(Normalize(low, max(high, low + 1e-6)), "viridis")
+    axes.figure.colorbar(scale, ax=axes, label="height of the bottom (m)", shrink=0.8, pad=0.01)
     axes.set_xlabel("easting (m)")
     axes.set_ylabel("northing (m)")
     axes.ticklabel_format(useOffset=False, style="plain")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from planning.full_resolution import FullMap
     from planning.large import Reduced
     from planning.limits import VehicleLimits
+    from planning.obstacles import Obstacles
     from planning.problem import Problem
 
 logger = logging.getLogger(__name__)
@@ -35,6 +36,7 @@ class Given:
     via: tuple[tuple[float, float], ...]
     vehicle: Path | None
     avoid: Path | None
+    objects: Path | None
     regions: Path | None
     region_weights: str
     map_sigma: float | None
@@ -90,15 +92,18 @@ def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked
     if reduced is None:
         return Asked(problem, None, more)
     problem = replace(problem, submerged=not reduced.lowest_m > 0)
-    bars, errors = (
+    asked_of_windows = (
         no_go(given.avoid, grid.crs),
         position_sigma(given.position_sigma, given.map_path),
+        standing(given.objects, grid),
     )
     if given.error_correlation is None:
         # Ten cells as stored, not ten blocks: fewer patches would take k for smaller than it is.
         problem = replace(problem, correlation_m=10.0 * max(reduced.cell_m))
     more |= {"reduced_cell_m": grid.cell_m, "map_cells": cells}
-    return Asked(problem, FullMap(given.map_path, given.map_sigma, reduced, bars, errors), more)
+    return Asked(
+        problem, FullMap(given.map_path, given.map_sigma, reduced, *asked_of_windows), more
+    )
 
 
 def posed(given: Given, grid: Grid, limits: VehicleLimits, weight: FloatArray | None) -> Problem:
@@ -113,6 +118,7 @@ def posed(given: Given, grid: Grid, limits: VehicleLimits, weight: FloatArray | 
         terms=read_terms(given.cost_path),
         weight=weight,
         forbidden=no_go(given.avoid, grid.crs)(grid),
+        obstacles=standing(given.objects, grid)(grid),
         position_sigma_m=position_sigma(given.position_sigma, given.map_path)(grid),
         currents=read_currents(given.currents, grid) if given.currents else None,
         risk=given.risk,
@@ -261,6 +267,37 @@ def no_go(path: Path | None, crs: str) -> Callable[[Grid], BoolArray | None]:
 
     polygons = read_polygons(path, crs)
     return lambda grid: forbidden_cells(grid, polygons)
+
+
+def standing(path: Path | None, whole: Grid) -> Callable[[Grid], Obstacles | None]:
+    """Return what gives the objects that stand on a grid; None where no file is given.
+
+    Parameters
+    ----------
+    whole : the map, which names the CRS, and on which at least one object must lie.
+    """
+    if path is None:
+        return lambda grid: None
+    import numpy as np
+
+    from mapping.object_layer import read_objects
+    from planning.obstacles import obstacles_on
+
+    objects = read_objects(path, whole)
+    row, col = whole.fractional_index(objects.easting_m, objects.northing_m)
+    rows, cols = whole.shape
+    on_map = (row > -1) & (row < rows) & (col > -1) & (col < cols)
+    if len(on_map) and not on_map.any():
+        raise NoOverlapError(
+            f"{path}: none of its {len(on_map)} objects lies on the map; give the list of the same "
+            "survey, in the map's CRS"
+        )
+    hills = on_map & ~objects.crater
+    logger.info(
+        "%s: %d objects stand on the map, %d of them of unknown height", path, np.sum(hills),
+        np.sum(hills & objects.least),
+    )  # fmt: skip
+    return lambda grid: obstacles_on(grid, objects)
 
 
 def _weights(grid: Grid, given: Given, reduced: Reduced | None) -> FloatArray | None:

@@ -99,6 +99,14 @@ def write_route_files(out: Path, route: Route, limits: VehicleLimits) -> None:
         logger.warning("the map has no CRS: route.gpx and route.plan need one and are left out")
 
 
+def clearance_told(route: Route, floor_m: float, k: float) -> str:
+    """Return in words what is proved of the clearance, and how much of it is to spare."""
+    over = f"{floor_m:g} m" + (f" + {k:.2f} sigma" if k > 0 else "")
+    spare = max(route.min_clearance_margin_m, 0.0)
+    more = f"{spare:.2f} m to spare" if spare >= 0.005 else "with nothing to spare"
+    return f"nowhere less than {over}, proved, {more}"
+
+
 def tell_route(plan: Plan, seconds: float, out: Path) -> None:
     """Print what the route is like."""
     route = plan.route
@@ -108,10 +116,7 @@ def tell_route(plan: Plan, seconds: float, out: Path) -> None:
         ("cost", f"{route.cost:.1f} ({plan.ratio:.3f} of the limit-free grid search)"),
         ("lower bound", f"{plan.lower_bound:.1f}"),
         ("altitude", f"mean {route.mean_altitude_m:.2f} m, least {route.min_altitude_m:.2f} m"),
-        (
-            "least margin",
-            f"{route.min_clearance_margin_m:.4f} m over floor + {plan.k:.2f} sigma, proved",
-        ),
+        ("clearance", clearance_told(route, plan.surface.limits.floor_m, plan.k)),
         ("stand-off", f"{route.min_stand_off_m:.2f} m, the least slant distance to the ground"),
         ("time", f"{seconds:.2f} s"),
         ("written", str(out / "route.csv")),

@@ -12,6 +12,7 @@ from scenarios.commands.console import print_table
 from scenarios.outputs import write_metrics
 from scenarios.route_inputs import Given, from_true_north, read_around, read_asked
 from scenarios.route_outputs import (
+    clearance_told,
     figures,
     tell_route,
     write_plan,
@@ -149,7 +150,7 @@ def survey(run: Run) -> None:
         rows = [
             ("lines", f"{len(found.lines)} covering {covering}"),
             ("track", f"{route.length_m:.0f} m with turns, {hours:.2f} h"),
-            ("least margin", f"{route.min_clearance_margin_m:.4f} m, proved"),
+            ("clearance", clearance_told(route, surface.limits.floor_m, surface.k)),
             ("stand-off", f"{route.min_stand_off_m:.2f} m"),
             ("written", str(run.out / "route.csv")),
         ]

@@ -27,7 +27,23 @@ def score_mission(out: Path, stages: list[str]) -> dict[str, float]:
         scores |= score_map(out / "map", truth)
     if "locate" in stages:
         scores |= score_navigation(out / "simulate" / "nav.csv", out / "locate", truth)
+    if "plan" in stages and (out / "plan" / "route.csv").exists():
+        scores |= score_route(out / "plan" / "route.csv", truth)
     return scores
+
+
+def score_route(path: Path, truth: Path) -> dict[str, float]:
+    """Score a route by its least altitude over the true floor, looked up every quarter of a cell."""
+    floor = read_map(truth / "elevation.tif")
+    route = np.genfromtxt(path, delimiter=",", names=True)
+    along = route["distance_m"]
+    steps = max(2, int(4.0 * along[-1] / floor.cell_m))
+    at = np.linspace(0.0, along[-1], steps)
+    easting, northing, depth = (
+        np.interp(at, along, route[name]) for name in ("easting_m", "northing_m", "depth_m")
+    )
+    altitude = -depth - floor.sample(easting, northing)
+    return {"route_min_true_altitude_m": float(np.nanmin(altitude))}
 
 
 def score_map(folder: Path, truth: Path) -> dict[str, float]:

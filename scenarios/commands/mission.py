@@ -27,7 +27,7 @@ _HEADLINES = {
     "route_cost": ("route: cost", ""),
     "route_lower_bound": ("route: no route costs less than", ""),
     "route_mean_altitude_m": ("route: mean altitude", "m"),
-    "route_min_margin_m": ("route: least margin over the floor, proved", "m"),
+    "route_min_true_altitude_m": ("route: least altitude over the true floor", "m"),
 }
 
 

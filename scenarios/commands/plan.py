@@ -51,6 +51,10 @@ class Position(click.ParamType):  # type: ignore[type-arg]
 @click.option("--vehicle", type=click.Path(path_type=Path), help="Limits, a TOML file.")
 @click.option("--avoid", type=click.Path(path_type=Path), help="No-go areas, a vector file.")
 @click.option(
+    "--objects", type=click.Path(path_type=Path),
+    help="objects.gpkg or .csv of `map`: boulders that the map smooths are held clear of too.",
+)  # fmt: skip
+@click.option(
     "--regions", type=click.Path(path_type=Path), help="regions.tif to take weights from."
 )
 @click.option("--region-weights", default="", help="'none', or a TOML file with [weights].")

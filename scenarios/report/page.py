@@ -44,6 +44,24 @@ STAGES: dict[str, tuple[str, str]] = {
     "diff": ("Difference of two maps", "Where two maps differ, and by how much."),
 }
 
+# Picture file -> what it shows; pictures of single passes go by the name without their number.
+CAPTIONS: dict[str, str] = {
+    "strip": "One pass: the echoes by ping and slant range with the bottom track, the levels cut from "
+    "them, and the elevation strip.",
+    "map": "Elevation with shaded relief; the track as navigated and as corrected.",
+    "sigma": "1-sigma of every cell's height, all causes together.",
+    "mosaic": "Echo mosaic: how strongly the ground returns, gain and angle taken out.",
+    "difference": "The first map, the second minus the first with changed places outlined, and the "
+    "histogram.",
+    "regions": "Hills, valleys and ridges by the signs of mean (H) and Gaussian (K) curvature.",
+    "legend": "Which signs of H and K make which class.",
+    "locate": "The track on the prior map, how well the position is known and when it may be trusted, "
+    "and the offset from dead reckoning.",
+    "observability": "Where the ground can fix a vehicle, and how well.",
+    "route": "The route from above, and its height over the ground with what must be kept clear.",
+    "blocked": "No route: the path that breaks least, and the place that blocks.",
+}
+
 # Pictures that open a section; the others of the folder are folded away.
 _FIRST = 4
 
@@ -122,7 +140,9 @@ def _picture_order(path: Path) -> tuple[bool, str]:
 
 
 def _picture(path: Path) -> Picture:
-    caption = path.stem.replace("-", " ").replace("_", " ").capitalize()
+    plain = path.stem.replace("-", " ").replace("_", " ").capitalize()
+    kind = path.stem.rstrip("0123456789").rstrip("-_")
+    caption = f"{plain}. {CAPTIONS[kind]}" if kind in CAPTIONS else plain
     return Picture(caption, base64.b64encode(path.read_bytes()).decode("ascii"))
 
 

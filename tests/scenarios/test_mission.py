@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import rasterio
 
-from mapping.rasters import read_map
+from mapping.rasters import read_map, write_map
 from mapping.trajectories import read_trajectory
+from perception.records import Grid
 from scenarios.pipeline import STAGES
-from scenarios.scores import score_map
+from scenarios.scores import score_map, score_route
 from tests.scenarios.command_line import run_command
 from tests.scenarios.tiny import write_tiny
 
@@ -66,6 +67,18 @@ def test_the_map_beats_interpolated_soundings_of_the_same_survey(finished):
     assert scores["map_to_soundings_ratio"] < 1.0
     # Three passes of a few minutes: the share scatters widely about the 68 % it should be.
     assert 0.4 < scores["map_within_1sigma"] < 0.95
+
+
+def test_a_route_is_scored_by_its_least_altitude_over_the_true_floor(tmp_path):
+    """A boulder of 2 m between two waypoints, under a level route 5 m above the floor around it."""
+    floor = np.full((41, 41), -30.0)
+    floor[20, 20] = -28.0
+    (tmp_path / "truth").mkdir()
+    write_map(tmp_path / "truth" / "elevation.tif", Grid(floor, 0.0, 41.0, 1.0, crs="EPSG:32630"))
+    route = tmp_path / "route.csv"
+    route.write_text("easting_m,northing_m,depth_m,distance_m\n2.5,20.5,25,0\n38.5,20.5,25,36\n")
+    found = score_route(route, tmp_path / "truth")["route_min_true_altitude_m"]
+    assert found == pytest.approx(3.0, abs=0.3)
 
 
 def test_an_interrupted_mission_goes_on_where_it_stopped(finished):

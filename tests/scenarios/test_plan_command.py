@@ -488,3 +488,31 @@ def test_metrics_come_after_the_route_and_nothing_is_left_of_one_that_cannot_be_
     assert "disk full" in str(plan(chart, tmp_path).exception)
     assert json.loads((tmp_path / "metrics.json").read_text())["solved"] is False
     assert not (tmp_path / "route.csv").exists()
+
+
+def test_objects_that_the_map_smooths_lift_the_route_and_count_in_the_metrics(chart, tmp_path):
+    """A wall of boulders across the canyon: the route must clear it by its floor."""
+    rows = [f"{WEST + col + 0.5},{NORTH - 80.5},hill,4.0,0.1" for col in range(2, 158, 2)]
+    path = tmp_path / "objects.csv"
+    path.write_text("easting_m,northing_m,kind,height_m,sigma_m\n" + "\n".join(rows) + "\n")
+    least = {}
+    for name, more in (("plain", ()), ("clear", ("--objects", path))):
+        result = plan(chart, tmp_path / name, *more)
+        assert result.exception is None, result.exception
+        with (tmp_path / name / "route.csv").open() as stream:
+            route = list(csv.DictReader(stream))
+        least[name] = min(
+            float(row["altitude_m"])
+            for row in route
+            if abs(float(row["northing_m"]) - (NORTH - 80.5)) < 2.0
+        )
+    assert least["clear"] > least["plain"] + 3.0
+    assert "objects.csv" in (tmp_path / "clear" / "config.toml").read_text()
+
+
+def test_objects_of_another_place_are_refused(chart, tmp_path):
+    path = tmp_path / "objects.csv"
+    path.write_text("easting_m,northing_m,kind,height_m\n10,20,hill,4.0\n")
+    result = plan(chart, tmp_path / "out", "--objects", path)
+    assert isinstance(result.exception, NoOverlapError)
+    assert "none of its 1 objects lies on the map" in str(result.exception)

@@ -31,6 +31,14 @@ def test_a_report_holds_every_stage_and_points_to_no_other_file(tmp_path):
     assert ">0.1235<" in text and ">yes<" in text and ">–<" in text
 
 
+def test_a_caption_says_what_a_picture_shows(tmp_path):
+    _png(tmp_path / "strips" / "strip-003.png")
+    _png(tmp_path / "strips" / "something-else.png")
+    text = write_report(tmp_path).read_text()
+    assert "Strip 003. One pass: the echoes by ping and slant range" in text
+    assert "<figcaption>Something else</figcaption>" in text
+
+
 def test_a_single_stage_folder_gets_a_report_too(tmp_path):
     write_metrics(tmp_path / "map", {"cells": 12}, {})
     assert "Map and track" in write_report(tmp_path / "map").read_text()
