@@ -52,5 +52,5 @@ def _why_barred(surface: Surface, row: int, col: int) -> str:
         "ceiling": f"lies where floor and k sigma need {lower - bottom:.2f} m of altitude, above the "
         f"ceiling of {limits.ceiling_m:g} m; raise ceiling_m or --risk",
         "current": "lies where the current is as strong as the vehicle; raise speed_m_s or move it",
-        "no-go": "lies in a no-go area; move it out",
+        "no-go": "lies in a no-go area, or on an object whose height no look gives; move it out",
     }[bar_of(surface, row, col)]

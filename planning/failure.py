@@ -127,7 +127,7 @@ def _what_bars(surface: Surface, wall: IntArray) -> str:
         "no data": "where the map has no data: survey or fill it",
         "no sigma": "where the map has no sigma: give --map-sigma",
         "current": "where the current is as strong as the vehicle: a higher speed_m_s opens it",
-        "no-go": "in a no-go area: leave it out or move an end",
+        "no-go": "in a no-go area or on an object of unknown height: leave it out or move an end",
     }[bar]
 
 

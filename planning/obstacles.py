@@ -78,7 +78,7 @@ def obstacles_on(grid: Grid, objects: ObjectLayer) -> Obstacles:
 def raised(
     lower_m: FloatArray, obstacles: Obstacles, floor_m: float, sigma_m: FloatArray | None, k: float
 ) -> FloatArray:
-    """Return the least height of a vehicle that clears the objects too; NaN and barred ground NaN.
+    """Return the least height of a vehicle that clears the objects too; NaN stays NaN.
 
     Parameters
     ----------
@@ -88,5 +88,4 @@ def raised(
     sigma = obstacles.sigma_m if sigma_m is None else np.hypot(sigma_m, obstacles.sigma_m)
     over = obstacles.top_m + floor_m + k * sigma
     # maximum, not fmax: ground that is unknown to the map stays so under an object.
-    lower = np.where(np.isfinite(obstacles.top_m), np.maximum(lower_m, over), lower_m)
-    return np.where(obstacles.barred, np.nan, lower)
+    return np.where(np.isfinite(obstacles.top_m), np.maximum(lower_m, over), lower_m)

@@ -135,6 +135,8 @@ def build_surface(
         barred |= bottom + limits.ceiling_m < np.maximum(lower, -limits.depth_max_m)
     if forbidden is not None:
         barred |= forbidden
+    if obstacles is not None:
+        barred |= obstacles.barred
     w = np.ones(bottom.shape) if weight is None else np.asarray(weight, float)
     w = np.where(np.isfinite(w), w, 1.0)
     if terms.uncertainty_per_m > 0 and sigma_m is not None:

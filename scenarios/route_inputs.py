@@ -85,10 +85,13 @@ def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked
     else:
         grid = read_map(given.map_path, given.map_sigma)
     _tell_of_sigma(given, grid, limits)
+    problem = posed(given, grid, from_true_north(limits, grid, given.start, given.goal), None)
+    if reduced is None:
+        # Of block means the ends are judged at full resolution, later.
+        check_ends(problem, (given.start, *given.via, given.goal))
     began = time.perf_counter()
-    weight = _weights(grid, given, reduced)
+    problem = replace(problem, weight=_weights(grid, given, reduced))
     more: dict[str, Any] = {"regions_s": time.perf_counter() - began}
-    problem = posed(given, grid, from_true_north(limits, grid, given.start, given.goal), weight)
     if reduced is None:
         return Asked(problem, None, more)
     problem = replace(problem, submerged=not reduced.lowest_m > 0)
@@ -104,6 +107,17 @@ def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked
     return Asked(
         problem, FullMap(given.map_path, given.map_sigma, reduced, *asked_of_windows), more
     )
+
+
+def check_ends(problem: Problem, stops: tuple[tuple[float, float] | None, ...]) -> None:
+    """Refuse ends where no route can be before the work that takes time; k is still unknown and 0."""
+    from planning.ends import end_node
+
+    surface = problem.surface(problem.clearance_sigma_m(), 0.0)
+    for number, stop in enumerate(stops):
+        name = "start" if number == 0 else "goal" if number == len(stops) - 1 else f"--via {number}"
+        if stop is not None:
+            end_node(surface, stop, name)
 
 
 def posed(given: Given, grid: Grid, limits: VehicleLimits, weight: FloatArray | None) -> Problem:
@@ -319,6 +333,7 @@ def _weights(grid: Grid, given: Given, reduced: Reduced | None) -> FloatArray | 
     from mapping.region_files import read_regions
 
     regions = read_regions(given.regions)
+    _refuse_other_crs(given.regions, regions.crs, grid.crs)
     near = 0.01 * grid.cell_m
     moved = max(
         abs(regions.west_m - grid.west_m),

@@ -57,7 +57,11 @@ class Position(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--regions", type=click.Path(path_type=Path), help="regions.tif to take weights from."
 )
-@click.option("--region-weights", default="", help="'none', or a TOML file with [weights].")
+@click.option(
+    "--region-weights",
+    default="",
+    help="'none', or a TOML file with [weights]; without: H-K weights.",
+)
 @click.option("--map-sigma", type=float, help="1-sigma of the map, m, instead of its band.")
 @click.option("--risk", type=float, default=0.01, show_default=True, help="Of breaking the floor.")
 @click.option("--error-correlation", type=float, help="Length over which map errors hold, m.")
@@ -151,6 +155,13 @@ def _refuse_mixed(given: Given) -> None:
         )
     if given.planner == "fmt" and given.space != "corridor":
         raise click.UsageError("--planner fmt plans in --space corridor only")
+    for name, value in (
+        ("--swath", given.swath),
+        ("--overlap", given.overlap),
+        ("--travelled", given.travelled),
+    ):
+        if not math.isfinite(value):
+            raise click.UsageError(f"{name} must be a number, got {value:g}")
     if given.seed < 0:
         raise click.UsageError(f"--seed must be 0 or more, got {given.seed}")
     if not 0 < given.risk < 1:

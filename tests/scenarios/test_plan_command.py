@@ -516,3 +516,21 @@ def test_objects_of_another_place_are_refused(chart, tmp_path):
     result = plan(chart, tmp_path / "out", "--objects", path)
     assert isinstance(result.exception, NoOverlapError)
     assert "none of its 1 objects lies on the map" in str(result.exception)
+
+
+def test_ends_off_the_map_are_refused_before_the_map_is_segmented(chart, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "perception.regions.segment",
+        lambda *_: pytest.fail("segmented before the ends were checked"),
+    )
+    result = run(
+        "--map", chart, "--start", "1,2", "--goal", position(150, 80), "--out", tmp_path,
+        "--no-picture",
+    )  # fmt: skip
+    assert isinstance(result.exception, InputError)
+    assert "start 1.00,2.00 lies off the map" in str(result.exception)
+
+
+def test_a_number_that_is_none_is_refused_as_wrong_usage(chart, tmp_path):
+    result = plan(chart, tmp_path, "--swath", "nan")
+    assert "--swath must be a number, got nan" in str(result.exception)
