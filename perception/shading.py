@@ -262,7 +262,12 @@ def trace_rays(  # type: ignore[no-untyped-def]
                 continue
             q = r * (cols - 1) + c
             cs = share * slope_h * r2 / (lever * lever)
-            c0 = -share * slope_h * r2 * (1 + p * p) / (lever * lever * lever)
+            # A floor that rises meets the same ranges nearer, where it slopes otherwise: how echoes of
+            # one feature from two sides tell its height.
+            bend = 0.0
+            if j >= 2 and j + 3 < last:
+                bend = (zed[j + 3] - zed[j + 2] - zed[j - 1] + zed[j - 2]) / (4 * step * step)
+            c0 = -share * slope_h * r2 * (1 + p * p - d * bend) / (lever * lever * lever)
             sums[q, 0] += weight
             sums[q, 1] += weight * cs * ux
             sums[q, 2] += weight * cs * uy
