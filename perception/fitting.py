@@ -1,7 +1,8 @@
 """Fit one shadow's surroundings with the bump-or-pit model: height, shape, place, and their covariance.
 
 The likelihood has many hills of its own: all starts are weighed on a coarse copy of the echo, the best of every
-length and outline climb there, and the few that lead go on in full.
+length and outline climb there, and the few that lead go on in full. No family of shapes is true: the height is
+the mean over families, each weighed by its evidence, and their spread is part of its sigma.
 """
 
 from __future__ import annotations
@@ -9,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from perception.records import FloatArray, IntArray
-from perception.silhouettes import N_PARAMETERS, N_SHAPE, fisher_step, log_likelihood
+from perception.silhouette_likelihood import HIGHLIGHT_CAP, Heard, climb, score
+from perception.silhouettes import N_PARAMETERS, Form, Scene, radius_at
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,7 @@ class Patch:
     start_m, step_m : near edge of the first bin and width of a bin, slant.
     weight : looks times independent part of one cell.
     leak : level inside shadows.
+    beam_rad : spread of the horizontal beam, two-way, 1-sigma.
     """
 
     ratio: FloatArray
@@ -35,6 +37,7 @@ class Patch:
     step_m: float
     weight: float
     leak: float
+    beam_rad: float = 0.0
 
     def halved(self) -> Patch:
         """Return the patch with bins joined in pairs; a cell of one known bin counts as that bin."""
@@ -68,8 +71,8 @@ class Starts:
 class BumpFit:
     """The best bump (`sign` 1) or pit (-1), with the parameters of `perception.silhouettes`.
 
-    `corner` is 2 for an elliptic footprint, 4 for a rectangular one; `gain` is the log likelihood over that of
-    a flat floor, priors included.
+    `corner` is 2 for an elliptic footprint, 4 for a rectangular one, `power` the family (`silhouettes.Form`);
+    `gain` is the log likelihood over that of a flat floor, priors included.
     """
 
     parameters: FloatArray
@@ -77,6 +80,11 @@ class BumpFit:
     sign: float
     corner: float
     gain: float
+    power: float = 0.0
+
+    @property
+    def form(self) -> Form:
+        return Form(self.sign, self.corner, self.power)
 
     @property
     def height_m(self) -> float:
@@ -84,22 +92,15 @@ class BumpFit:
         return float(np.exp(self.parameters[2]))
 
 
-# A highlight above this many times nominal is "bright" and no more.
-HIGHLIGHT_CAP = 5.0
-# Priors in logarithms: objects are about as long as wide; shapes lie between a Gaussian and a flat top.
-_ASPECT_SIGMA = 0.5
-_SHAPE_MEAN, _SHAPE_SIGMA = float(np.log(1.7)), 0.6
-_SHAPE_LOW, _SHAPE_HIGH = float(np.log(0.8)), float(np.log(8.0))
-# The floor's angular law is near Lambert's square, but recorders and sediments differ.
-_LAW_MEAN, _LAW_SIGMA = float(np.log(1.95)), 0.13
-# The gain follows albedo over blocks larger than objects; patches of sediment are smaller.
-_LEVEL_SIGMA = 0.3
 _FACETS_PER_BIN = 1.5
 # Rounds of climbing: every start on the coarse patch, the best of those, and the leaders in full.
 _FIRST_ROUNDS, _MIDDLE_ROUNDS, _LAST_ROUNDS = 3, 5, 14
 _MIDDLE_STARTS, _LAST_STARTS = 3, 2
 # A kind this far behind the other after the coarse rounds will not catch up.
 _BEHIND = 0.6
+# Profiles that end (powers of `Form`), climbed beside the best generalised Gaussian; cones are rare, by so much
+# evidence. Evidence counts a third: no family is true, and what it cannot have is taken for proof.
+_ENDED, _RARE, _TEMPER = (1.0, 2.0), 2.0, 3.0
 # Halving a patch of fewer bins would leave too little of it.
 _LEAST_BINS = 36
 
@@ -110,7 +111,7 @@ def fit_patch(patch: Patch, starts: Starts, favour: float = 0.0) -> BumpFit | No
     `favour` is what other evidence adds to the log likelihood of a hill over a crater.
     """
     coarse = patch.halved() if patch.ratio.shape[1] >= _LEAST_BINS else patch
-    value = _score(starts.sign, starts.corner, starts.parameters, *_fixed(coarse))
+    value = score(starts.sign, starts.corner, starts.parameters, *_fixed(coarse))
     chosen = _leaders(starts, value)
     climbed = {
         sign: _climbed(coarse, starts.take(chosen[starts.sign[chosen] == sign]))
@@ -122,7 +123,40 @@ def fit_patch(patch: Patch, starts: Starts, favour: float = 0.0) -> BumpFit | No
         if fits and fits[0].gain > _BEHIND * best:
             found += [_climb(patch, fit, _LAST_ROUNDS) for fit in fits[:_LAST_STARTS]]
     good = [fit for fit in found if fit is not None]
-    return max(good, key=lambda fit: fit.gain + 0.5 * fit.sign * favour) if good else None
+    if not good:
+        return None
+    top = max(good, key=lambda fit: fit.gain + 0.5 * fit.sign * favour)
+    others = [_climb(patch, _recast(top, power), _LAST_ROUNDS) for power in _ENDED]
+    same = [fit for fit in good if fit.sign == top.sign]
+    return _mixed(same + [fit for fit in others if fit is not None])
+
+
+def _recast(fit: BumpFit, power: float) -> BumpFit:
+    """Return where the climb of a profile that ends starts: as wide as the fit at a tenth of its height."""
+    at = fit.parameters.copy()
+    at[3:5] += np.log(radius_at(0.1, at[5], fit.power) / radius_at(0.1, 0.0, power))
+    at[5] = 0.0
+    return replace(fit, parameters=at, power=power)
+
+
+def _mixed(fits: list[BumpFit]) -> BumpFit:
+    """Return the likeliest fit with the mean height of all, each by its evidence, and their spread in its variance.
+
+    The profile is told as the generalised Gaussian of the same widths at half and at a tenth of its height.
+    """
+    evidence = np.array([fit.gain - (_RARE if fit.power == 1.0 else 0.0) for fit in fits])
+    weight = np.exp((evidence - evidence.max()) / _TEMPER)
+    weight /= weight.sum()
+    log_height = np.array([fit.parameters[2] for fit in fits])
+    variance = np.array([fit.covariance[2, 2] for fit in fits])
+    best = fits[int(np.argmax(evidence))]
+    at, covariance = best.parameters.copy(), best.covariance.copy()
+    at[2] = weight @ log_height
+    covariance[2, 2] = weight @ (variance + np.square(log_height - at[2]))
+    half, tenth = (radius_at(part, at[5], best.power) for part in (0.5, 0.1))
+    at[5] = np.log(0.5 * np.log(np.log(2) / np.log(10)) / np.log(half / tenth))
+    at[3:5] += np.log(tenth / radius_at(0.1, at[5], 0.0))
+    return replace(best, parameters=at, covariance=covariance, power=0.0)
 
 
 def _leaders(starts: Starts, value: FloatArray) -> IntArray:
@@ -151,15 +185,13 @@ def _climbed(patch: Patch, starts: Starts) -> list[BumpFit]:
 
 def _climb(patch: Patch, start: BumpFit, rounds: int) -> BumpFit | None:
     """Climb the posterior of a patch from a fit's parameters; None where it leads nowhere."""
-    at, value, information = climb(
-        start.parameters, start.sign, start.corner, *_fixed(patch), rounds
-    )
+    at, value, information = climb(start.parameters, start.form, *_fixed(patch), rounds)
     if not (np.all(np.isfinite(at)) and np.all(np.isfinite(information))):
         return None
     # Unseen directions come out very wide.
     covariance = np.linalg.inv(information + 1e-6 * np.eye(N_PARAMETERS))
     gain = float(value - _flat_likelihood(patch))
-    return BumpFit(at, covariance, start.sign, start.corner, gain)
+    return replace(start, parameters=at, covariance=covariance, gain=gain)
 
 
 def _facet_m(patch: Patch) -> float:
@@ -169,11 +201,13 @@ def _facet_m(patch: Patch) -> float:
     return float(patch.step_m * far_m / ground_m / _FACETS_PER_BIN)
 
 
-def _fixed(
-    patch: Patch,
-) -> tuple[FloatArray, FloatArray, FloatArray, float, float, float, float, float, float]:
-    return (patch.ratio, patch.drop_m, patch.along_m, patch.start_m, patch.step_m, patch.leak,
-            _facet_m(patch), HIGHLIGHT_CAP, patch.weight)  # fmt: skip
+def _fixed(patch: Patch) -> tuple[Scene, Heard]:
+    """Return what the kernels need of a patch."""
+    lines = patch.along_m
+    spacing_m = max(float(lines[-1] - lines[0]) / max(len(lines) - 1, 1), 1e-6)
+    scene = Scene(patch.drop_m, lines, patch.start_m, patch.step_m, patch.leak, _facet_m(patch),
+                  patch.beam_rad / spacing_m)  # fmt: skip
+    return scene, Heard(patch.ratio, patch.weight)
 
 
 def _flat_likelihood(patch: Patch) -> float:
@@ -181,99 +215,3 @@ def _flat_likelihood(patch: Patch) -> float:
     mean = 1.0 + patch.leak
     each = np.where(e < HIGHLIGHT_CAP, e / mean + np.log(mean), HIGHLIGHT_CAP / mean)
     return float(-patch.weight * each.sum())
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _prior(parameters):  # type: ignore[no-untyped-def]
-    """Return log prior, its gradient (10,) and its information (10, 10)."""
-    gradient = np.zeros(N_PARAMETERS)
-    information = np.zeros((N_PARAMETERS, N_PARAMETERS))
-    aspect = (parameters[3] - parameters[4]) / _ASPECT_SIGMA**2
-    shape = (parameters[5] - _SHAPE_MEAN) / _SHAPE_SIGMA**2
-    law = (parameters[6] - _LAW_MEAN) / _LAW_SIGMA**2
-    gradient[3], gradient[4], gradient[5], gradient[6] = -aspect, aspect, -shape, -law
-    information[3, 3] = information[4, 4] = 1 / _ASPECT_SIGMA**2
-    information[3, 4] = information[4, 3] = -1 / _ASPECT_SIGMA**2
-    information[5, 5] = 1 / _SHAPE_SIGMA**2
-    information[6, 6] = 1 / _LAW_SIGMA**2
-    level = 0.0
-    for p in range(N_SHAPE, N_PARAMETERS):
-        gradient[p] = -parameters[p] / _LEVEL_SIGMA**2
-        information[p, p] = 1 / _LEVEL_SIGMA**2
-        level += parameters[p] ** 2 / _LEVEL_SIGMA**2
-    value = -0.5 * (
-        level
-        + aspect * (parameters[3] - parameters[4])
-        + shape * (parameters[5] - _SHAPE_MEAN)
-        + law * (parameters[6] - _LAW_MEAN)
-    )
-    return value, gradient, information
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _score(  # type: ignore[no-untyped-def]
-    sign, corner, parameters, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
-):
-    """Return the log posterior (s,) of every start."""
-    value = np.empty(len(sign))
-    for s in range(len(sign)):
-        value[s] = log_likelihood(
-            parameters[s], sign[s], corner[s], ratio, drop_m, along_m, start_m, step_m, leak,
-            facet_m, cap, weight,
-        ) + _prior(parameters[s])[0]  # fmt: skip
-    return value
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def climb(  # type: ignore[no-untyped-def]
-    start, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight, rounds
-):
-    """Climb the posterior from `start` by damped Fisher scoring, at most `rounds` steps.
-
-    Returns the parameters (10,), log posterior and its information (10, 10).
-    """
-    at, damping = start.copy(), 1e-2
-    value, gradient, information = fisher_step(
-        at, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
-    )
-    prior = _prior(at)
-    value += prior[0]
-    limit = np.array([0.0, 0.0, 0.5, 0.5, 0.5, 0.7, 0.3, 0.3, 0.3, 0.3])
-    for _ in range(rounds):
-        whole = information + prior[2]
-        for p in range(N_PARAMETERS):
-            whole[p, p] += damping * whole[p, p] + 1e-6
-        step = np.linalg.solve(whole, gradient + prior[1])
-        # A logarithm moves by half at most, a place by the object's own width: the model is not linear.
-        limit[0], limit[1] = np.exp(at[3]), np.exp(at[4])
-        trial = at + np.minimum(np.maximum(step, -limit), limit)
-        trial[5] = min(max(trial[5], _SHAPE_LOW), _SHAPE_HIGH)
-        trial_prior = _prior(trial)
-        trial_value = trial_prior[0] + log_likelihood(
-            trial, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
-        )
-        rise = trial_value - value
-        if rise > 0:
-            at, prior, damping = trial, trial_prior, max(damping * 0.3, 1e-4)
-            value, gradient, information = fisher_step(
-                at,
-                sign,
-                corner,
-                ratio,
-                drop_m,
-                along_m,
-                start_m,
-                step_m,
-                leak,
-                facet_m,
-                cap,
-                weight,
-            )
-            value += prior[0]
-            if rise < 0.05:
-                break
-        else:
-            damping *= 6
-            if damping > 1e4:
-                break
-    return at, value, information + prior[2]

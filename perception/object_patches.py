@@ -27,6 +27,7 @@ def cut_patch(
     levels: Levels,
     sample_m: float,
     track: Track,
+    beam_rad: float = 0.0,
 ) -> Patch:
     """Cut the echo around a shadow: one length to either side in range, half a width along."""
     n, m = ratio.shape
@@ -58,12 +59,14 @@ def cut_patch(
     mean[slant < 1.03 * drop[:, None]] = np.nan
     return Patch(
         ratio=np.ascontiguousarray(mean),
-        along_m=np.ascontiguousarray(track.along_m[lines].reshape(-1, tall).mean(axis=1)),
-        drop_m=np.ascontiguousarray(drop),
+        # To a micrometre: the last digit of a place must not decide where a climb ends.
+        along_m=np.round(track.along_m[lines].reshape(-1, tall).mean(axis=1), 6),
+        drop_m=np.round(drop, 6),
         start_m=col0 * sample_m,
         step_m=wide * sample_m,
         weight=float(np.clip(weight, 0.2, _MOST_WEIGHT)),
         leak=levels.shadow_level,
+        beam_rad=beam_rad,
     )
 
 

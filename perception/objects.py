@@ -40,6 +40,8 @@ class ObjectConfig:
     fits, fits_per_ping : at most ``fits + fits_per_ping * pings`` shadows a side, the largest, are fitted;
         on a floor strewn with shadows the rest are measured by the plain relation, which is quick, and
         those below `plain_cells` samples are left out.
+    beam_deg : width of the horizontal beam, two-way between its -3 dB points; few files tell it, and most
+        side-scans have some 1 degree one-way.
     """
 
     min_samples: int = 6
@@ -51,6 +53,7 @@ class ObjectConfig:
     fits: int = 30
     fits_per_ping: float = 0.025
     plain_cells: int = 60
+    beam_deg: float = 0.7
 
 
 # The footprint is known after the fit alone; before it a shadow this unlikely is given up.
@@ -60,6 +63,8 @@ _HOPELESS = 0.1
 _SURE_ORDER, _ORDER_WEIGHT = 3.0, 3.0
 # A shadow that runs out of the swath proves a least height; how much higher it may be, as a part of it.
 _OPEN_SPREAD = 0.7
+# Of a Gaussian, the width between half powers over its 1-sigma.
+_FULL_WIDTH = 2.355
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +184,10 @@ def _fitted(shadow: Shadow, edges: _Edges, order: float, seen: _Side) -> BumpFit
     starts = first_guesses(shadow, edges.start_m, edges.end_m, edges.drop_m, seen.track)
     if abs(order) > _SURE_ORDER:
         starts = starts.take(np.flatnonzero(starts.sign * order > 0))
-    patch = cut_patch(shadow, seen.marks, seen.ratio, seen.levels, seen.sample_m, seen.track)
+    patch = cut_patch(
+        shadow, seen.marks, seen.ratio, seen.levels, seen.sample_m, seen.track,
+        float(np.deg2rad(seen.config.beam_deg)) / _FULL_WIDTH,
+    )  # fmt: skip
     return fit_patch(patch, starts, favour=_ORDER_WEIGHT * order)
 
 
@@ -211,8 +219,8 @@ def _of_fit(fit: BumpFit, edges: _Edges, pings: int, dark: float, seen: _Side) -
     relative = np.sqrt(
         fit.covariance[2, 2] + seen.config.shape_sigma**2 + (edges.drop_sigma_m / drop) ** 2
     )
-    # The horizontal beam's spread, which the model has not, blurs what few pings see.
-    relative = np.hypot(relative, 0.12 / max(pings, 1))
+    # How wide the horizontal beam truly is blurs what few pings see.
+    relative = np.hypot(relative, 0.06 / max(pings, 1))
     # Nearer than about the altitude the echo folds over itself and is dimmed by slope as much as by shadow:
     # in trials up to a fifth of the height was off there.
     relative = np.hypot(relative, 0.25 * np.clip(1.3 - x0 / drop, 0.0, 0.8))
@@ -220,7 +228,7 @@ def _of_fit(fit: BumpFit, edges: _Edges, pings: int, dark: float, seen: _Side) -
     hill = fit.sign > 0
     return ObjectRow(
         easting_m=np.nan, northing_m=np.nan, kind="hill" if hill else "crater",
-        height_m=height, sigma_m=float(np.hypot(height * relative, _relief(half, seen))),
+        height_m=height, sigma_m=float(np.hypot(height * relative, _relief(half, edges, seen))),
         slant_range_m=edges.start_m, shadow_length_m=edges.length_m, pass_index=0, ping=0,
         across_m=float(x0), along_m=float(y0), half_across_m=half_across, half_along_m=half_along,
         shape=beta, gain=fit.gain,
@@ -228,12 +236,18 @@ def _of_fit(fit: BumpFit, edges: _Edges, pings: int, dark: float, seen: _Side) -
     )  # fmt: skip
 
 
-def _relief(half_size_m: float, seen: _Side) -> float:
-    """Return the 1-sigma of the floor's own relief across a footprint, against which a height stands."""
+def _relief(half_size_m: float, edges: _Edges, seen: _Side) -> float:
+    """Return what the floor's own relief leaves open of a height, 1-sigma (m).
+
+    The ring around a footprint, against which a height stands, averages over several differences: half
+    the variogram. The floor at the shadow's end lies above or below the object's foot by a difference of its own:
+    ``dH = z_end Rs / (Rs + Ls)``.
+    """
     if seen.roughness is None:
         return 0.0
-    # Half the variogram: the ring around a footprint averages over several such differences.
-    return float(np.sqrt(0.5 * seen.roughness.variogram(np.array(half_size_m))))
+    ground = [float(ground_range(np.array(v), np.array(edges.drop_m))) for v in (edges.start_m, edges.end_m)]  # fmt: skip
+    ring, end = seen.roughness.variogram(np.array([half_size_m, ground[1] - ground[0]]))
+    return float(np.sqrt(0.5 * ring + 2 * end * (edges.start_m / edges.end_m) ** 2))
 
 
 def _fitted_half_m(fit: BumpFit | None) -> float:

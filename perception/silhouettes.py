@@ -1,10 +1,14 @@
 """Echo of one bump or pit on a flat floor: the model whose shadow and shading are fitted to an object.
 
 A smooth hill's shadow starts below its summit, a box's at its far edge, a crater's end bounds its depth from
-below: each relation has its own bias. One family covers them: elliptic generalised Gaussians
-``z = A exp(-(q^beta) / 2)``, ``q = (x-x0)^2/sx^2 + (y-y0)^2/sy^2``: beta 1 is a Gaussian, 2 about a half
-sphere, 6 a flat top with steep walls; A < 0 a crater. Facets along each ping's line are lit or hidden
-by the ray geometry and summed into slant bins (Lambert), relative to the flat floor.
+below: each relation has its own bias. Two families of profiles over ``q = (x-x0)^2/sx^2 + (y-y0)^2/sy^2`` cover them:
+
+- generalised Gaussians ``z = A exp(-q^beta / 2)``: beta 1 is a Gaussian, 6 a flat top with steep walls;
+- profiles that end, ``z = A (1 - q^(power/2))^beta``: power 2 a half sphere (beta 1/2), a paraboloid (1) or
+  a cosine's bell (about 2), power 1 a cone;
+
+A < 0 a crater. Facets along each ping's line are lit or hidden by the ray geometry and summed into slant bins
+(Lambert), relative to the flat floor; then lines are mixed as the horizontal beam mixes them.
 
 The profile and the law of incidence are powers, which cost more than all the rest of a facet: each set of
 parameters tabulates them once.
@@ -12,98 +16,131 @@ parameters tabulates them once.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+
+from perception.records import FloatArray
 
 # Parameters in the order of the vector: x0, y0, log|A|, log sx, log sy, log beta, log kappa; then the log level
 # of the surroundings and its slopes over half the patch, across and along. Kappa is the exponent of the floor's
 # angular law, cos^kappa of the incidence (Lambert: 2).
 N_SHAPE, N_PARAMETERS = 7, 10
 
-# The likelihood takes no mean for darker than this. At a shadow's true level one lit sample where the family
-# of shapes has none would outweigh fifty that agree; dark enough is dark.
-LEAST_MEAN = 0.15
-
 # Steps of the tables of profile and incidence; linear between, to 1e-5 of the height.
 _TABLE = 256
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (n, m) with the mean echo per slant bin, 1 where the flat floor shows.
+class Form(NamedTuple):
+    """What a fit does not move: kind, outline and family, numbers for the kernels' sake.
 
-    Parameters
-    ----------
-    parameters : (7,) x0, y0, log|A|, log sx, log sy, log beta, log kappa (metres; x is ground range).
-    sign : 1 hill, -1 crater.
-    corner : exponent of the footprint's outline: 2 an ellipse, 4 a rectangle with rounded corners.
-    drop_m, along_m : (n,) height of the sonar above the floor and place along the track, per ping.
-    start_m, step_m : near edge of the first bin, width of a bin, slant.
-    leak : level inside shadows.
-    facet_m : ground length of a facet.
+    `sign` 1 hill, -1 crater; `corner` exponent of the footprint's outline: 2 an ellipse, 4 a rectangle with
+    rounded corners; `power` 0 a generalised Gaussian, else the power of a profile that ends.
     """
-    n, m = out.shape
+
+    sign: float
+    corner: float
+    power: float
+
+
+class Scene(NamedTuple):
+    """Where the sonar looks from, and the bins it hears in.
+
+    `drop_m`, `along_m` (n,): height of the sonar above the floor and place along the track, per ping. `start_m`,
+    `step_m`: near edge of the first bin, width of a bin, slant. `leak`: level inside shadows. `facet_m`: ground
+    length of a facet. `blur`: spread of the horizontal beam (1-sigma, rad) over the pings' spacing (m); 0 looks
+    along a line.
+    """
+
+    drop_m: FloatArray
+    along_m: FloatArray
+    start_m: float
+    step_m: float
+    leak: float
+    facet_m: float
+    blur: float
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def predict(parameters: FloatArray, form: Form, scene: Scene, out: FloatArray) -> FloatArray:
+    """Fill `out` (n, m) with the mean echo per slant bin, 1 where the flat floor shows, and return it.
+
+    `parameters`: (7,) or more, x0, y0, log|A|, log sx, log sy, log beta, log kappa (metres; x is ground range).
+    """
     x0, y0 = parameters[0], parameters[1]
     sx, sy, beta = np.exp(parameters[3]), np.exp(parameters[4]), np.exp(parameters[5])
-    kappa = np.exp(parameters[6])
-    # The bump ends where it is 1/500 of its height; outside only its shadow remains.
-    rho_end = 12.4 ** (0.5 / beta)
-    profile, law = _tables(sign * np.exp(parameters[2]), beta, kappa, rho_end)
-    for i in range(n):
-        drop = drop_m[i]
-        dy = abs(along_m[i] - y0) / sy
-        for k in range(m):
-            out[i, k] = 0.0
-        x_low = x_high = 1e9
+    # A Gaussian ends where it is 1/500 of its height; outside only its shadow remains.
+    rho_end = 12.4 ** (0.5 / beta) if form.power == 0.0 else 1.0
+    height = form.sign * np.exp(parameters[2])
+    profile, law = _tables(height, beta, form.power, np.exp(parameters[6]), rho_end)
+    for i in range(out.shape[0]):
+        out[i, :] = 0.0
+        dy = abs(scene.along_m[i] - y0) / sy
+        x_low = x_high = 0.0
         if dy < rho_end:
-            if corner == 2.0:
-                half = sx * (rho_end**2 - dy**2) ** 0.5
-            else:
-                half = sx * (rho_end**corner - dy**corner) ** (1.0 / corner)
-            x_low, x_high = max(x0 - half, 0.02 * drop), x0 + half
-        if x_high <= x_low or x_low >= 1e8:
-            for k in range(m):
-                out[i, k] = 1.0 + leak
+            half = sx * (rho_end**form.corner - dy**form.corner) ** (1.0 / form.corner)
+            x_low, x_high = max(x0 - half, 0.02 * scene.drop_m[i]), x0 + half
+        if x_high <= x_low:
+            out[i, :] = 1.0 + scene.leak
             continue
         resume = _trace(
-            out[i],
-            x_low,
-            x_high,
-            dy,
-            x0,
-            sx,
-            corner,
-            profile,
-            rho_end,
-            law,
-            drop,
-            start_m,
-            step_m,
-            facet_m,
-        )
-        r_low, r_resume = (
-            (x_low * x_low + drop * drop) ** 0.5,
-            (resume * resume + drop * drop) ** 0.5,
-        )
-        for k in range(m):
-            near, far = start_m + k * step_m, start_m + (k + 1) * step_m
-            floor = max(min(far, r_low) - near, 0.0) + max(far - max(near, r_resume), 0.0)
-            if out[i, k] > 0.0:
-                ray = 0.5 * (near + far)
-                ground = max(ray * ray - drop * drop, 0.25 * step_m * step_m) ** 0.5
-                # Flat floor: cos^kappa of the incidence times the ground length of a bin.
-                out[i, k] /= _at(law, drop / ray * _TABLE) * step_m * ray / ground
-            out[i, k] += min(floor / step_m, 1.0) + leak
+            out[i], x_low, x_high, dy, x0, sx, form.corner, profile, rho_end, law,
+            scene.drop_m[i], scene.start_m, scene.step_m, scene.facet_m,
+        )  # fmt: skip
+        _add_floor(out[i], x_low, resume, law, scene.drop_m[i], scene)
+    _spread(out, scene.blur, scene.start_m, scene.step_m)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tables(height, beta, kappa, rho_end):  # type: ignore[no-untyped-def]
+def _add_floor(row, x_low, resume, law, drop, scene):  # type: ignore[no-untyped-def]
+    """Turn the facets' energy of one line into power over nominal, and add the floor beside the object."""
+    r_low, r_resume = (x_low**2 + drop**2) ** 0.5, (resume**2 + drop**2) ** 0.5
+    step_m = scene.step_m
+    for k in range(len(row)):
+        near, far = scene.start_m + k * step_m, scene.start_m + (k + 1) * step_m
+        floor = max(min(far, r_low) - near, 0.0) + max(far - max(near, r_resume), 0.0)
+        if row[k] > 0.0:
+            ray = 0.5 * (near + far)
+            ground = max(ray * ray - drop * drop, 0.25 * step_m * step_m) ** 0.5
+            # Flat floor: cos^kappa of the incidence times the ground length of a bin.
+            row[k] /= _at(law, drop / ray * _TABLE) * step_m * ray / ground
+        row[k] += min(floor / step_m, 1.0) + scene.leak
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _spread(out, blur, start_m, step_m):  # type: ignore[no-untyped-def]
+    """Mix the lines of `out` as the horizontal beam does, in place: its footprint widens with range.
+
+    Steps of diffusion whose variances add up to the beam's, so that no footprint is too wide or too narrow.
+    """
+    n, m = out.shape
+    widest = (blur * (start_m + m * step_m)) ** 2
+    if n < 2 or widest < 1e-3:
+        return
+    steps = min(int(widest / 0.5) + 1, 16)
+    for _ in range(steps):
+        for k in range(m):
+            side = min((blur * (start_m + (k + 0.5) * step_m)) ** 2 / (2.0 * steps), 0.25)
+            before = out[0, k]
+            for i in range(n):
+                here = out[i, k]
+                after = out[i + 1, k] if i + 1 < n else here
+                out[i, k] = here + side * (before - 2.0 * here + after)
+                before = here
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tables(height, beta, power, kappa, rho_end):  # type: ignore[no-untyped-def]
     """Return the profile over radius (0 to `rho_end`) and cos^kappa over the cosine (0 to 1)."""
     profile, law = np.empty(_TABLE + 2), np.empty(_TABLE + 2)
     for j in range(_TABLE + 2):
         at = j / _TABLE
-        profile[j] = height * np.exp(-0.5 * (at * rho_end) ** (2.0 * beta))
+        if power == 0.0:
+            profile[j] = height * np.exp(-0.5 * (at * rho_end) ** (2.0 * beta))
+        else:
+            profile[j] = height * max(1.0 - at**power, 0.0) ** beta
         law[j] = min(at, 1.0) ** kappa
     return profile, law
 
@@ -187,135 +224,9 @@ def _deposit(row, r_a, r_b, energy, start_m, step_m):  # type: ignore[no-untyped
             row[k] += energy * part
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _soft(mean, cap):  # type: ignore[no-untyped-def]
-    """Compress means above 0.6 cap smoothly: a hard cut would leave the fit no slope to climb."""
-    bend = 0.6 * cap
-    if mean <= bend:
-        return mean
-    return bend + bend * (1.0 - np.exp(-(mean - bend) / bend))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _surroundings(parameters, n, m):  # type: ignore[no-untyped-def]
-    """Return the level (n, m) of the floor around the object: albedo that the gain has not followed."""
-    level = np.empty((n, m))
-    for i in range(n):
-        row = parameters[7] + parameters[9] * (2.0 * i / max(n - 1, 1) - 1.0)
-        for k in range(m):
-            level[i, k] = np.exp(row + parameters[8] * (2.0 * k / max(m - 1, 1) - 1.0))
-    return level
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _slopes(  # type: ignore[no-untyped-def]
-    parameters,
-    sign,
-    corner,
-    drop_m,
-    along_m,
-    start_m,
-    step_m,
-    leak,
-    facet_m,
-    cap,
-    base,
-    around,
-    mean,
-):
-    """Return the derivatives (10, n, m) of the mean by every parameter."""
-    n, m = base.shape
-    slopes = np.empty((N_PARAMETERS, n, m))
-    moved = parameters.copy()
-    for p in range(N_SHAPE):
-        # Half a facet of position, or 2 % of a logarithm: smooth over the facets' own steps.
-        h = 0.5 * facet_m if p < 2 else 0.02
-        moved[p] = parameters[p] + h
-        predict(moved, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, slopes[p])
-        moved[p] = parameters[p]
-        for i in range(n):
-            for k in range(m):
-                if slopes[p, i, k] == base[i, k]:
-                    slopes[p, i, k] = 0.0
-                else:
-                    after = max(_soft(slopes[p, i, k] * around[i, k], cap), LEAST_MEAN)
-                    slopes[p, i, k] = (after - mean[i, k]) / h
-    for i in range(n):
-        for k in range(m):
-            by_level = 0.0
-            if mean[i, k] > LEAST_MEAN:
-                by_level = (_soft(base[i, k] * around[i, k] * 1.02, cap) - mean[i, k]) / 0.02
-            slopes[7, i, k] = by_level
-            slopes[8, i, k] = by_level * (2.0 * k / max(m - 1, 1) - 1.0)
-            slopes[9, i, k] = by_level * (2.0 * i / max(n - 1, 1) - 1.0)
-    return slopes
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def fisher_step(  # type: ignore[no-untyped-def]
-    parameters, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
-):
-    """Return the log likelihood, its gradient (10,) and Fisher information (10, 10) of one patch.
-
-    Samples are Gamma with the model's mean; data above `cap` are censored and the mean is compressed
-    there, so the strength of a highlight (the object's own reflectivity) says little beyond "bright".
-    `weight` is looks times the independent part of the samples; NaN samples say nothing.
-    """
-    n, m = ratio.shape
-    base = np.empty((n, m))
-    predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, base)
-    around = _surroundings(parameters, n, m)
-    mean = np.empty((n, m))
-    for i in range(n):
-        for k in range(m):
-            mean[i, k] = max(_soft(base[i, k] * around[i, k], cap), LEAST_MEAN)
-    slopes = _slopes(
-        parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, cap, base, around, mean
-    )  # fmt: skip
-    value = 0.0
-    gradient = np.zeros(N_PARAMETERS)
-    information = np.zeros((N_PARAMETERS, N_PARAMETERS))
-    for i in range(n):
-        for k in range(m):
-            e = ratio[i, k]
-            if np.isnan(e):
-                continue
-            mu = mean[i, k]
-            # A datum above the cap is censored: it says "more than the cap" and no more.
-            if e < cap:
-                value -= weight * (e / mu + np.log(mu))
-                pull = weight * (e - mu) / (mu * mu)
-            else:
-                value -= weight * cap / mu
-                pull = weight * cap / (mu * mu)
-            for p in range(N_PARAMETERS):
-                s = slopes[p, i, k]
-                if s == 0.0:
-                    continue
-                gradient[p] += pull * s
-                for o in range(p + 1):
-                    information[p, o] += weight * s * slopes[o, i, k] / (mu * mu)
-    for p in range(N_PARAMETERS):
-        for o in range(p):
-            information[o, p] = information[p, o]
-    return value, gradient, information
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def log_likelihood(  # type: ignore[no-untyped-def]
-    parameters, sign, corner, ratio, drop_m, along_m, start_m, step_m, leak, facet_m, cap, weight
-):
-    """Return the log likelihood of one patch, as `fisher_step` has it."""
-    n, m = ratio.shape
-    base = np.empty((n, m))
-    predict(parameters, sign, corner, drop_m, along_m, start_m, step_m, leak, facet_m, base)
-    around = _surroundings(parameters, n, m)
-    value = 0.0
-    for i in range(n):
-        for k in range(m):
-            e = ratio[i, k]
-            if np.isnan(e):
-                continue
-            mu = max(_soft(base[i, k] * around[i, k], cap), LEAST_MEAN)
-            value -= weight * (e / mu + np.log(mu) if e < cap else cap / mu)
-    return value
+def radius_at(part: float, log_beta: float, power: float) -> float:
+    """Return the radius, in sizes, at which a profile has fallen to `part` (0 to 1) of its extreme."""
+    beta = float(np.exp(log_beta))
+    if power == 0.0:
+        return float((-2 * np.log(part)) ** (0.5 / beta))
+    return float((1 - part ** (1 / beta)) ** (1 / power))

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perception.fitting import HIGHLIGHT_CAP
 from perception.objects import ObjectTable, write_objects_csv
-from perception.silhouettes import predict
+from perception.silhouette_likelihood import HIGHLIGHT_CAP
+from perception.silhouettes import Form, Scene, predict
 from perception.strips import build_strip
 from tests.perception.echo_fixtures import (
     Height,
@@ -34,7 +34,7 @@ def _found(height: Height, seed: int = 0, survey: Survey = SURVEY) -> ObjectTabl
 @pytest.mark.parametrize(
     "name, height, kind, truth, x, tolerance",
     [
-        # Tolerances: 2.5 of the claimed sigma of such an object at one look.
+        # Tolerances: 2.5 of the claimed sigma of such an object at one look; the height is the median of three.
         ("smooth hill", gaussian(1.3, 15, 20, 1.1), "hill", 1.3, 15.0, 0.15),
         ("half sphere", boulder(1.0, -16, 20), "hill", 1.0, -16.0, 0.12),
         ("box", box(1.0, 18, 20, 1.0, 1.2), "hill", 1.0, 18.0, 0.15),
@@ -46,10 +46,11 @@ def _found(height: Height, seed: int = 0, survey: Survey = SURVEY) -> ObjectTabl
 def test_height_kind_and_place_come_back(
     name: str, height: Height, kind: str, truth: float, x: float, tolerance: float
 ) -> None:
-    table = _found(height)
+    looks = [_found(height, seed) for seed in range(3)]
+    table = looks[0]
     assert len(table) == 1, f"{name}: {len(table)} objects"
-    assert table.kind == (kind,)
-    assert abs(table.height_m[0] / truth - 1) < tolerance
+    assert all(look.kind == (kind,) for look in looks)
+    assert abs(np.median([look.height_m[0] for look in looks]) / truth - 1) < tolerance
     assert abs(table.across_m[0] - x) < 1.0 and abs(table.along_m[0] - 20) < 0.5
     # The survey runs north from (1000, 5000): starboard is east.
     assert abs(table.easting_m[0] - (1000 + x)) < 1.0
@@ -119,8 +120,8 @@ def test_the_model_of_the_fit_agrees_with_independent_facets() -> None:
     )
     parameters = np.array([15, 0, np.log(1.5), np.log(1.2), np.log(1.2), 0.0, np.log(2.0)])
     model = predict(
-        parameters, 1.0, 2.0, np.array([10.0]), np.array([0.0]), 0.0, 0.06, 0.0, 0.03,
-        np.zeros((1, 600)),
+        parameters, Form(1.0, 2.0, 0.0),
+        Scene(np.array([10.0]), np.array([0.0]), 0.0, 0.06, 0.0, 0.03, 0.0), np.zeros((1, 600)),
     )[0]  # fmt: skip
     far = slice(200, 550)
     smooth = np.convolve(reference[far], np.ones(5) / 5, mode="same")
