@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -42,44 +44,107 @@ class Surface:
         return float(self.independent[row, col]) * rho / (1 - rho**2) / scale
 
 
-def correlate(
-    u: FloatArray, wu: FloatArray, v: FloatArray, wv: FloatArray, reach: int
-) -> Surface | None:
-    """Correlate two weighted fields over shifts of up to `reach` cells.
+@dataclass(frozen=True, slots=True)
+class Side:
+    """What one of two fields brings to a correlation: transforms that several channels share.
+
+    `weight`, `mask` are those of the weights and of where they are positive; `field`, `square` of weight times
+    the field and times its square. `number` is of cells with data, `size` of cells on a side.
+    """
+
+    weight: npt.NDArray[np.complexfloating[Any]]
+    mask: npt.NDArray[np.complexfloating[Any]]
+    field: npt.NDArray[np.complexfloating[Any]]
+    square: npt.NDArray[np.complexfloating[Any]]
+    number: float
+    size: int
+
+    @classmethod
+    def of(cls, values: FloatArray, weights: FloatArray) -> Side:
+        """Transform a field and its weights."""
+        mask = (weights > 0).astype(np.float32)
+        weighted = weights * values
+        planes = fft.rfft2(np.stack([weights, mask, weighted, weighted * values]))
+        return cls(planes[0], planes[1], planes[2], planes[3], float(mask.sum()), len(values))
+
+    def carrying(self, values: FloatArray, weights: FloatArray) -> Side:
+        """Return the same weights under another field."""
+        weighted = weights * values
+        planes = fft.rfft2(np.stack([weighted, weighted * values]))
+        return replace(self, field=planes[0], square=planes[1])
+
+
+@dataclass(frozen=True, slots=True)
+class Products:
+    """Correlations of two sides over the search, (s, s) each, and the variance of `total` under no match."""
+
+    total: FloatArray
+    power_u: FloatArray
+    power_v: FloatArray
+    common: FloatArray
+    variance: float
+    n_u: float
+
+    def surface(self, sign: float = 1.0) -> Surface | None:
+        """Return what the products say of each shift; `sign` -1 turns one of the fields upside down."""
+        energy = np.sqrt(np.maximum(self.power_u, 0.0) * np.maximum(self.power_v, 0.0))
+        if self.variance <= 0 or energy.max() <= 0:
+            return None
+        common = self.common
+        good = (common > 0.3 * common.max()) & (energy > 1e-6 * energy.max())
+        rho = np.where(good, sign * self.total / np.where(good, energy, 1.0), 0.0)
+        rho = np.clip(rho, -0.999, 0.999)
+        number = np.maximum(common, 1.0)
+        variance = self.variance * number / self.n_u
+        independent = np.minimum(energy**2 / variance, number)
+        likelihood = -0.5 * independent * np.log1p(-(np.maximum(rho, 0.0) ** 2))
+        significance = np.where(good, sign * self.total / np.sqrt(variance), 0.0)
+        return Surface(
+            rho, np.where(good, likelihood, 0.0), common, independent, energy, significance
+        )
+
+
+def products(left: Side, right: Side, reach: int, alike: Products | None = None) -> Products | None:
+    """Correlate two sides over shifts of up to `reach` cells; None where either has hardly a cell.
 
     Under no match the sum over x of U(x) V(x + d) has the variance sum over lags of R_U R_V, whatever the
     fields' own correlation; dividing by it tells how many cells the square is really worth.
+
+    Parameters
+    ----------
+    alike : products of the same `right` with another field under the weights of `left`: what does not
+        depend on that field is taken from there.
     """
-    mask_u, mask_v = (wu > 0).astype(np.float32), (wv > 0).astype(np.float32)
-    n_u, n_v = float(mask_u.sum()), float(mask_v.sum())
-    if n_u < 25 or n_v < 25:
+    if left.number < 25 or right.number < 25:
         return None
-    weighted_u, weighted_v = wu * u, wv * v
-    left = fft.rfft2(np.stack([weighted_u, weighted_u * u, wu, mask_u]))
-    right = fft.rfft2(np.stack([weighted_v, wv, weighted_v * v, mask_v]))
-    size = u.shape[0]
-    products = fft.irfft2(np.conj(left) * right, s=u.shape)
+    size = left.size
+    planes = [np.conj(left.field) * right.field, np.conj(left.square) * right.weight]
+    if alike is None:
+        planes += [np.conj(left.weight) * right.square, np.conj(left.mask) * right.mask]
+    whole = fft.irfft2(np.stack(planes), s=(size, size))
     steps = np.arange(-reach, reach + 1) % size
-    num, power_u, power_v, common = products[:, steps[:, None], steps]
-    power = np.abs(left[0]) ** 2 * np.abs(right[0]) ** 2
+    near = whole[:, steps[:, None], steps]
+    power_v, common = (near[2], near[3]) if alike is None else (alike.power_v, alike.common)
+    power = _squared(left.field) * _squared(right.field)
     # The half spectrum of a real field counts each inner column twice.
-    twice = np.full(power.shape[1], 2.0)
-    twice[0] = 1.0
+    total = 2.0 * float(power.sum(dtype=np.float64)) - float(power[:, 0].sum(dtype=np.float64))
     if size % 2 == 0:
-        twice[-1] = 1.0
-    power = (power * twice).astype(np.float64) / (float(size) ** 2 * n_v)
-    variance = power.sum()
-    energy = np.sqrt(np.maximum(power_u, 0.0) * np.maximum(power_v, 0.0))
-    if variance <= 0 or energy.max() <= 0:
-        return None
-    good = (common > 0.3 * common.max()) & (energy > 1e-6 * energy.max())
-    rho = np.where(good, num / np.where(good, energy, 1.0), 0.0)
-    rho = np.clip(rho, -0.999, 0.999)
-    variance_d = variance * np.maximum(common, 1.0) / n_u
-    independent = np.minimum(energy**2 / variance_d, np.maximum(common, 1.0))
-    likelihood = -0.5 * independent * np.log1p(-(np.maximum(rho, 0.0) ** 2))
-    significance = np.where(good, num / np.sqrt(variance_d), 0.0)
-    return Surface(rho, np.where(good, likelihood, 0.0), common, independent, energy, significance)
+        total -= float(power[:, -1].sum(dtype=np.float64))
+    variance = total / (float(size) ** 2 * right.number)
+    return Products(near[0], near[1], power_v, common, variance, left.number)
+
+
+def _squared(spectrum: npt.NDArray[np.complexfloating[Any]]) -> FloatArray:
+    squared: FloatArray = spectrum.real**2 + spectrum.imag**2
+    return squared
+
+
+def correlate(
+    u: FloatArray, wu: FloatArray, v: FloatArray, wv: FloatArray, reach: int
+) -> Surface | None:
+    """Correlate two weighted fields over shifts of up to `reach` cells (`products`)."""
+    found = products(Side.of(u, wu), Side.of(v, wv), reach)
+    return None if found is None else found.surface()
 
 
 # Of the objects that one pass shows the other shows about a third at the same place (other side, other
@@ -98,6 +163,8 @@ def landmark_field(
     ln(1 - p + p D / mean density), with p the chance of being seen again. One coincidence proves nothing,
     five in one shift do. Hills and craters have fields of their own, laid side by side.
     """
+    if not (a.any() and b.any()):
+        return None
     points, gains = [], []
     seen = (wb > 0).astype(np.float32)
     ground = float(seen.sum())
@@ -223,13 +290,19 @@ def _second_moments(kx: FloatArray, ky: FloatArray, weight: FloatArray) -> Float
     return np.array([[(kx * kx * weight).sum(), xy], [xy, (ky * ky * weight).sum()]])
 
 
-def fan_filter(values: FloatArray, weights: FloatArray, gain: FloatArray) -> FloatArray:
-    """Return a field with each wave of its spectrum multiplied by `gain` (of `wave_directions`' shape)."""
+def fan_filters(
+    values: FloatArray, weights: FloatArray, gains: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return a field with each wave of its spectrum multiplied by each of `gains` (`wave_directions`' shape)."""
+    if not gains:
+        return []
     spectrum = fft.rfft2(np.where(weights > 0, values, 0.0).astype(np.float32))
-    filtered: FloatArray = fft.irfft2(spectrum * gain.astype(np.float32), s=values.shape)
-    return np.where(weights > 0, filtered, 0.0).astype(np.float32)
+    planes = spectrum * np.stack(gains).astype(np.float32)
+    filtered = fft.irfft2(planes, s=values.shape)
+    return [np.where(weights > 0, plane, 0.0).astype(np.float32) for plane in filtered]
 
 
+@lru_cache(maxsize=32)
 def wave_directions(size: int) -> tuple[FloatArray, FloatArray]:
     """Return unit east and north components of the waves of a half spectrum, zero for the mean."""
     north = fft.fftfreq(size)[:, None] + np.zeros(size // 2 + 1)

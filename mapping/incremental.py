@@ -20,14 +20,8 @@ from mapping.pose_graph import HeightStep, Link, Solution, solve
 from mapping.pose_graph_incremental import IncrementalGraph
 from mapping.registration import Match
 from mapping.rounds import Registration, TextureStore, register
-from mapping.survey import (
-    CorrectedSurvey,
-    SurveyConfig,
-    assemble,
-    check,
-    least_square_m,
-    swath_width,
-)
+from mapping.survey import CorrectedSurvey, SurveyConfig, assemble
+from mapping.survey_check import check, least_square_m, square_cell_m, swath_width
 from mapping.textures import default_cell, thinned
 from perception.records import ElevationStrip, Progress, silent
 
@@ -49,6 +43,8 @@ class IncrementalSurvey:
         self._textures = TextureStore(self._thin, self._config.match)
         self._ties: list[KeyframeFix] = []
         self._steps: list[HeightStep] = []
+        # The place of each link that the graph was ever given.
+        self._squares: list[Window] = []
         self._cell_m = self._keyframe_m = float("nan")
 
     def add_pass(
@@ -82,8 +78,8 @@ class IncrementalSurvey:
             Registration(w, m, bool(next(used)) if m.accepted else False) for w, m in found[0]
         ]
         return assemble(
-            self._strips, keyframes, solution, registrations, self._graph.links, self._ties,
-            self._steps, (), config,
+            self._strips, keyframes, solution, registrations, self._graph.links, self._squares,
+            self._ties, self._steps, (), config,
         )  # fmt: skip
 
     def _match(
@@ -99,7 +95,8 @@ class IncrementalSurvey:
             side_m = max(part * swath_width(self._strips), least_square_m(self._cell_m))
             windows = [w for w in find_overlaps(corrected, side_m) if w.second == new]
             results, links = register(
-                corrected, self._textures, keyframes, solution, windows, self._cell_m,
+                corrected, self._textures, keyframes, solution, windows,
+                square_cell_m(side_m, self._cell_m),
                 config.match, config.graph, config.widest_search_m, None, progress,
                 f"pass {new + 1}, round {number}",
             )  # fmt: skip
@@ -111,6 +108,7 @@ class IncrementalSurvey:
             ]
             before = len(graph.links)
             graph.add_links(links, steps)
+            self._squares += [w for w, m in results if m.accepted]
             self._steps += steps
             solution = self._doubted(keyframes, before)
             if not last:

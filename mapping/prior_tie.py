@@ -131,7 +131,7 @@ def _compare(
     share = float(
         np.sqrt(np.prod([_share(x, n) for x, n in zip((a[inside], b[inside]), noise, strict=True)]))
     )
-    shift, covariance, _, _, reason = judge(
+    found = judge(
         {"relief": (a, wa, b, wb)},
         {"relief": surface.scaled(share)},
         inner,
@@ -139,7 +139,7 @@ def _compare(
         MatchConfig(),
         expected_m2,
     )
-    return shift * cell_m, None if reason else covariance
+    return found.shift_cells * cell_m, None if found.reason else found.covariance_m2
 
 
 def _share(relief: FloatArray, noise_m2: float) -> float:

@@ -9,6 +9,7 @@ those along which they agree. docs/registration.md has the derivation.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
@@ -17,16 +18,18 @@ from scipy import fft
 
 from mapping.correlation import (
     Fields,
+    Products,
+    Side,
     Surface,
     coincide,
     correlate,
-    fan_filter,
+    fan_filters,
     landmark_field,
+    products,
     refine,
     wave_directions,
 )
 from mapping.textures import (
-    HEIGHT,
     OBJECTS,
     PORT,
     RELIEF,
@@ -38,6 +41,8 @@ from mapping.textures import (
 from perception.records import FloatArray
 
 _SIDES = ((PORT, "port"), (STARBOARD, "starboard"))
+# Where three less of evidence would do, two less of margin do: two fits of one square share most of their noise.
+_MARGIN_COUNTS = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,19 +53,19 @@ class Match:
     ----------
     shift_m : (2,) east and north by which features of the second strip lie from those of the first.
     covariance_m2 : (2, 2) from the match's own shape.
-    height_m, height_sigma_m : second strip's height minus the first's over the common ground; NaN none.
     evidence, margin : log-likelihood ratios against no match and against the next best shift.
     correlation : of each channel at the shift; a channel that was not used is not there.
+    spare : log-likelihood ratio beyond what is asked for; negative what it falls short by, minus infinity
+        where the match is refused for its shape.
     accepted, reason : whether the match may be believed, and why not.
     """
 
     shift_m: FloatArray
     covariance_m2: FloatArray
-    height_m: float
-    height_sigma_m: float
     evidence: float
     margin: float
     correlation: dict[str, float]
+    spare: float
     accepted: bool
     reason: str
 
@@ -100,33 +105,25 @@ def match(
         surfaces["relief"] = surfaces["relief"].scaled(float(share))
     if not surfaces:
         return _refused("no common ground")
-    shift, covariance, evidence, margin, reason = judge(
-        fields, surfaces, inner, cell_m, config, prior_m2
-    )
-    if reason and not np.isfinite(covariance).all():
-        return _refused(reason)
-    height_m, height_sigma_m = _height_between(
-        a[HEIGHT], wa[HEIGHT], b[HEIGHT], wb[HEIGHT], shift, covariance / cell_m**2
-    )
-    centre = tuple(np.round(shift[::-1]).astype(int) + reach)
+    found = judge(fields, surfaces, inner, cell_m, config, prior_m2)
+    if found.reason and not np.isfinite(found.covariance_m2).all():
+        return _refused(found.reason)
+    centre = tuple(np.round(found.shift_cells[::-1]).astype(int) + reach)
     correlation = {channel: float(surface.rho[centre]) for channel, surface in surfaces.items()}
     return Match(
-        shift_m=shift * cell_m,
-        covariance_m2=covariance,
-        height_m=height_m,
-        height_sigma_m=height_sigma_m,
-        evidence=evidence,
-        margin=margin,
+        shift_m=found.shift_cells * cell_m,
+        covariance_m2=found.covariance_m2,
+        evidence=found.evidence,
+        margin=found.margin,
         correlation=correlation,
-        accepted=not reason,
-        reason=reason,
+        spare=found.spare,
+        accepted=not found.reason,
+        reason=found.reason,
     )
 
 
 def _refused(reason: str) -> Match:
-    return Match(
-        np.zeros(2), np.full((2, 2), np.nan), np.nan, np.nan, 0.0, 0.0, {}, False, reason
-    )  # fmt: skip
+    return Match(np.zeros(2), np.full((2, 2), np.nan), 0.0, 0.0, {}, -np.inf, False, reason)
 
 
 def _compare(
@@ -134,49 +131,93 @@ def _compare(
     reach: int, cell_m: float,
 ) -> tuple[dict[str, Fields], dict[str, Surface]]:  # fmt: skip
     """Return the fields of every channel that the two squares have, and their correlations."""
-    fields: dict[str, Fields] = {"relief": (a[RELIEF], wa[RELIEF], b[RELIEF], wb[RELIEF])}
-    east, north = wave_directions(a.shape[1])
-    for (i, name_a), (j, name_b) in product(_SIDES, _SIDES):
-        if min((wa[i] > 0).sum(), (wb[j] > 0).sum()) < 0.02 * wa[i].size:
-            continue
-        towards = [
-            (east * np.cos(h) - north * np.sin(h)) * (1.0 if k == STARBOARD else -1.0)
-            for k, h in ((i, headings[0]), (j, headings[1]))
-        ]
-        facing = towards[0] * towards[1]
-        for kind, gain in (
-            ("echo", np.clip(1.0 + facing / 0.1, 0.0, 1.0)),
-            ("shading", np.clip((-facing - 0.2) / 0.2, 0.0, 1.0)),
-        ):
-            if gain.mean() > 0.08:
-                filtered = fan_filter(a[i], wa[i], gain)
-                fields[f"{kind} {name_a}-{name_b}"] = (filtered, wa[i], b[j], wb[j])
+    fields: dict[str, Fields] = {}
     surfaces: dict[str, Surface] = {}
-    for channel in list(fields):
-        surface = correlate(*fields[channel], reach)
-        if surface is not None and channel.startswith("shading"):
-            fields[channel], surface = _signed(fields[channel], surface, reach)
-        if surface is not None:
-            surfaces[channel] = surface
+    relief = correlate(a[RELIEF], wa[RELIEF], b[RELIEF], wb[RELIEF], reach)
+    if relief is not None:
+        fields["relief"] = (a[RELIEF], wa[RELIEF], b[RELIEF], wb[RELIEF])
+        surfaces["relief"] = relief
+    enough = 0.02 * wa[RELIEF].size
+    first = {k: Side.of(a[k], wa[k]) for k, _ in _SIDES if (wa[k] > 0).sum() >= enough}
+    second = {k: Side.of(b[k], wb[k]) for k, _ in _SIDES if (wb[k] > 0).sum() >= enough}
+    for (i, name_a), (j, name_b) in product(_SIDES, _SIDES):
+        if i not in first or j not in second:
+            continue
+        pair = (a[i], wa[i], b[j], wb[j])
+        gains = _gains(a.shape[1], _towards(i, headings[0]), _towards(j, headings[1]))
+        for kind, field, surface in _of_sides(pair, first[i], second[j], gains, reach):
+            fields[f"{kind} {name_a}-{name_b}"] = field
+            surfaces[f"{kind} {name_a}-{name_b}"] = surface
     landmarks = landmark_field(a[OBJECTS], wa[OBJECTS], b[OBJECTS], wb[OBJECTS], cell_m)
     if landmarks is not None:
         fields["objects"] = landmarks
         surfaces["objects"] = coincide(*landmarks, reach)
-    return {c: fields[c] for c in surfaces}, surfaces
+    return fields, surfaces
 
 
-def _signed(field: Fields, surface: Surface, reach: int) -> tuple[Fields, Surface | None]:
+def _towards(side: int, heading_rad: float) -> tuple[float, float]:
+    """Return the direction (east, north) in which a side of the sonar looks."""
+    sign = 1.0 if side == STARBOARD else -1.0
+    return sign * float(np.cos(heading_rad)), -sign * float(np.sin(heading_rad))
+
+
+def _gains(size: int, u: tuple[float, float], v: tuple[float, float]) -> dict[str, FloatArray]:
+    """Return which waves two looks towards `u` and `v` see alike ("echo") and which with opposite sign.
+
+    A kind of which there is next to nothing is left out.
+    """
+    east, north = wave_directions(size)
+    facing = (east * u[0] + north * u[1]) * (east * v[0] + north * v[1])
+    kinds = {
+        "echo": np.clip(1.0 + facing / 0.1, 0.0, 1.0),
+        "shading": np.clip((-facing - 0.2) / 0.2, 0.0, 1.0),
+    }
+    return {kind: gain for kind, gain in kinds.items() if gain.mean() > 0.08}
+
+
+def _of_sides(
+    pair: Fields, first: Side, second: Side, gains: dict[str, FloatArray], reach: int
+) -> Iterator[tuple[str, Fields, Surface]]:
+    """Yield kind, fields and correlation of a side of one pass with a side of the other."""
+    values, weights, other, other_weights = pair
+    known: Products | None = None
+    for kind, filtered in zip(
+        gains, fan_filters(values, weights, list(gains.values())), strict=True
+    ):
+        found = products(first.carrying(filtered, weights), second, reach, known)
+        if found is None:
+            continue
+        known = found
+        sign, surface = 1.0, found.surface()
+        if kind == "shading" and surface is not None:
+            sign, surface = _signed(found, surface)
+        if surface is not None:
+            yield kind, (filtered, weights, sign * other, other_weights), surface
+
+
+def _signed(found: Products, surface: Surface) -> tuple[float, Surface | None]:
     """Choose the sign of a correlation that may have either: the one whose extreme is twice the other's.
 
     The side lobes of either sign look like peaks of the other, so where neither is stronger neither counts.
     """
     high, low = float(surface.significance.max()), float(-surface.significance.min())
     if high >= 2.0 * low:
-        return field, surface
+        return 1.0, surface
     if low < 2.0 * high:
-        return field, None
-    u, wu, v, wv = field
-    return (u, wu, -v, wv), correlate(u, wu, -v, wv, reach)
+        return 1.0, None
+    return -1.0, found.surface(-1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the correlations of two squares say of their shift, east and north; the rest as in `Match`."""
+
+    shift_cells: FloatArray
+    covariance_m2: FloatArray
+    evidence: float
+    margin: float = 0.0
+    spare: float = -np.inf
+    reason: str = ""
 
 
 def judge(
@@ -186,8 +227,8 @@ def judge(
     cell_m: float,
     config: MatchConfig,
     prior_m2: FloatArray | None,
-) -> tuple[FloatArray, FloatArray, float, float, str]:
-    """Return shift (cells, east and north), covariance (m2), evidence, margin, and why not (or "")."""
+) -> Verdict:
+    """Choose the best shift of all correlations together, refine it below a cell, and weigh it."""
     total = np.sum([s.log_likelihood for s in surfaces.values()], axis=0)
     common = np.max([s.common for s in surfaces.values()], axis=0)
     reach = total.shape[0] // 2
@@ -200,14 +241,14 @@ def judge(
     evidence = float(total[row, col])
     nothing = np.full((2, 2), np.nan)
     if row in (0, 2 * reach) or col in (0, 2 * reach):
-        return best, nothing, evidence, 0.0, "best at the border of the search"
+        return Verdict(best, nothing, evidence, reason="best at the border of the search")
     gains = {c: s.gain(int(row), int(col)) for c, s in surfaces.items()}
     if "objects" in gains:
         # The correlation of points with gains is a log-likelihood as it stands.
         gains["objects"] = 1.0
     offset, covariance, lobe = refine(fields, gains, best, inner)
     if covariance is None or np.abs(offset).max() > 1.5:
-        return best, nothing, evidence, 0.0, "no clear peak"
+        return Verdict(best, nothing, evidence, reason="no clear peak")
     # A tenth of a cell is what two samplings of one ground leave of any peak (docs/registration.md).
     covariance = (covariance + 0.1**2 * np.eye(2)) * cell_m**2
     reach_of_peak = np.maximum(3.0 * lobe * np.sqrt(max(evidence, 1.0)), 3.0)
@@ -218,14 +259,15 @@ def judge(
     # The more places are looked at, the better the best of them fits by chance.
     places = max(1.0, float((2 * reach) ** 2 / np.prod(2.0 * np.maximum(lobe, 0.5)) / 4.0))
     needed = config.least_evidence + float(np.log(places))
+    spare = min(evidence - needed, _MARGIN_COUNTS * (margin - config.least_margin))
     reason = ""
     if evidence < needed:
         reason = f"too little in common (evidence {evidence:.1f} of {needed:.1f})"
     elif margin < config.least_margin:
         reason = f"not the only fit (margin {margin:.1f})"
-    elif np.sqrt(np.linalg.eigvalsh(covariance).max()) > 0.4 * reach * cell_m:
-        reason = "too wide a peak"
-    return best + offset, covariance, evidence, margin, reason
+    if np.sqrt(np.linalg.eigvalsh(covariance).max()) > 0.4 * reach * cell_m:
+        reason, spare = "too wide a peak", -np.inf
+    return Verdict(best + offset, covariance, evidence, margin, spare, reason)
 
 
 def _prior_cost(steps_m: FloatArray, prior_m2: FloatArray) -> FloatArray:
@@ -235,45 +277,3 @@ def _prior_cost(steps_m: FloatArray, prior_m2: FloatArray) -> FloatArray:
         inverse[0, 0] * x * x + 2 * inverse[0, 1] * x * y + inverse[1, 1] * y * y
     )
     return cost
-
-
-def _height_between(
-    a: FloatArray, wa: FloatArray, b: FloatArray, wb: FloatArray, shift: FloatArray, cov_cells: FloatArray
-) -> tuple[float, float]:  # fmt: skip
-    """Return mean height of the second less the first at the shift, and its 1-sigma.
-
-    Heights of a strip err together over metres, so the spread is taken between blocks a quarter of the
-    square wide, and a tilt of the ground turns the shift's own error into height.
-    """
-    col, row = (int(v) for v in np.floor(shift))
-    fx, fy = shift - np.floor(shift)
-    moved = np.zeros_like(b)
-    weight = np.full_like(wb, np.inf)
-    for dy, dx, part in (
-        (0, 0, (1 - fy) * (1 - fx)),
-        (0, 1, (1 - fy) * fx),
-        (1, 0, fy * (1 - fx)),
-        (1, 1, fy * fx),
-    ):
-        turn = (-(row + dy), -(col + dx))
-        moved += part * np.roll(b, turn, (0, 1))
-        weight = np.minimum(weight, np.roll(wb, turn, (0, 1)))
-    both = (wa > 0) & (weight > 0)
-    if both.sum() < 25:
-        return np.nan, np.nan
-    w = np.where(
-        both, 2.0 / (1.0 / np.where(both, wa, 1.0) + 1.0 / np.where(both, weight, 1.0)), 0.0
-    )
-    difference = np.where(both, moved - a, 0.0)
-    mean = float((w * difference).sum() / w.sum())
-    rows, cols = np.nonzero(both)
-    quarter = max(1, int(np.ptp(rows) + 1) // 4)
-    block = (rows // quarter) * 1000 + cols // quarter
-    _, inverse = np.unique(block, return_inverse=True)
-    weights = np.bincount(inverse, w[both])
-    means = np.bincount(inverse, (w * difference)[both]) / weights
-    n = weights.sum() ** 2 / (weights**2).sum()
-    spread = float((weights * (means - mean) ** 2).sum() / weights.sum())
-    plane = np.column_stack([cols - cols.mean(), rows - rows.mean()]).astype(float)
-    tilt = np.linalg.lstsq(plane, (a[both] - a[both].mean()).astype(float), rcond=None)[0]
-    return mean, float(np.sqrt(spread / max(n - 1.0, 1.0) + tilt @ cov_cells @ tilt + 1e-4))

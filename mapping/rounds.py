@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from mapping.fusion import default_cell as default_fusion_cell
 from mapping.fusion import fuse
 from mapping.keyframes import Keyframes
+from mapping.link_choice import believed
 from mapping.overlaps import Window
 from mapping.placed import extent
 from mapping.placed import placed as strip_placed
@@ -74,7 +75,9 @@ def register(
     """
     known = known_floor(corrected) if floor is None else floor
     needed = sorted({index for w in windows for index in (w.first, w.second)})
-    placed = {index: textures.placed(index, corrected[index], known) for index in needed}
+    with ThreadPoolExecutor(_THREADS) as pool:
+        made = pool.map(lambda index: textures.placed(index, corrected[index], known), needed)
+        placed = dict(zip(needed, made, strict=True))
 
     def compare(window: Window) -> tuple[tuple[int, int], Match]:
         first = keyframes.nearest(window.first, window.first_line)
@@ -93,23 +96,26 @@ def register(
         )
 
     results: list[tuple[Window, Match]] = []
-    links: list[Link] = []
+    ends: list[tuple[int, int]] = []
     # Transforms and gridding let go of the interpreter's lock; the order of results is that of the windows.
     with ThreadPoolExecutor(_THREADS) as pool:
-        for window, (ends, result) in zip(windows, pool.map(compare, windows), strict=True):
+        for window, (pair, result) in zip(windows, pool.map(compare, windows), strict=True):
             results.append((window, result))
-            if result.accepted:
-                links.append(
-                    _link(corrected, keyframes, solution, window, result, ends, graph, floor)
-                )
+            ends.append(pair)
             progress(label, len(results), len(windows))
+    results = [(w, m) for (w, _), m in zip(results, believed([m for _, m in results]), strict=True)]
+    links = [
+        _link(corrected, keyframes, solution, window, result, pair, graph, floor)
+        for (window, result), pair in zip(results, ends, strict=True)
+        if result.accepted
+    ]
     return results, links
 
 
 def known_floor(strips: Sequence[ElevationStrip]) -> Grid | None:
     """Return the floor as the strips know it so far, smooth: soundings between the tracks count most.
 
-    It serves to place echoes (`textures.placed_across`); a strip's heights are far better under its own
+    It serves to place echoes (`echo_places.placed_across`); a strip's heights are far better under its own
     track than at its rim, and `fuse` weights them so.
     """
     if not any(np.isfinite(s.elevation_m).any() for s in strips):

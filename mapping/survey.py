@@ -12,32 +12,25 @@ import numpy as np
 from mapping.crossings import height_steps
 from mapping.fixes import PositionFix
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
+from mapping.link_choice import apart, enough
 from mapping.overlaps import Window, find_overlaps
 from mapping.placing import at_lines, bridge, on_track
 from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, solve
 from mapping.prior_tie import ties_to_prior
 from mapping.rounds import Registration, TextureStore, register
 from mapping.sharing import solve_shared
+from mapping.survey_check import check, least_square_m, square_cell_m, swath_width
 from mapping.textures import MatchConfig, default_cell, thinned
 from perception.records import (
     ElevationStrip,
     FloatArray,
     Grid,
-    InputError,
     Progress,
     Trajectory,
     silent,
 )
 
 logger = logging.getLogger(__name__)
-
-# Squares of fewer cells hold too little to tell one place from another.
-_LEAST_CELLS = 24
-
-
-def least_square_m(cell_m: float) -> float:
-    """Return the width of the smallest square that is worth comparing."""
-    return _LEAST_CELLS * cell_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +112,8 @@ class CorrectedSurvey:
     """Strips on corrected tracks, the track with covariance, and how it came about.
 
     `height_sigma_m` (strips,) is the 1-sigma of each strip's height offset; `links`, `ties` and
-    `steps` are the registrations, fixes and height steps of the last graph (`graph_exchange` writes it).
+    `steps` are the registrations, fixes and height steps of the last graph (`pose_graph_files` writes it);
+    `squares` are the links' places, one each. `registrations` are all comparisons of the last round.
     """
 
     strips: tuple[ElevationStrip, ...]
@@ -132,6 +126,33 @@ class CorrectedSurvey:
     solution: Solution
     links: tuple[Link, ...] = ()
     ties: tuple[KeyframeFix, ...] = ()
+    steps: tuple[HeightStep, ...] = ()
+    squares: tuple[Window, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """What stays the same through the rounds; `thin` are the strips on the columns of the comparison."""
+
+    thin: list[ElevationStrip]
+    keyframes: Keyframes
+    ties: list[KeyframeFix]
+    textures: TextureStore
+    width_m: float
+    cell_m: float
+    config: SurveyConfig
+    floor: Grid | None
+    progress: Progress
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """What the rounds so far brought; `pool` are the registrations of all of them, `found` of the last."""
+
+    solution: Solution
+    rounds: tuple[Round, ...] = ()
+    found: tuple[Registration, ...] = ()
+    pool: tuple[tuple[Window, Link], ...] = ()
     steps: tuple[HeightStep, ...] = ()
 
 
@@ -162,54 +183,89 @@ def correct_survey(
     """
     config = config or SurveyConfig()
     check(strips)
-    keyframes = choose_keyframes(strips, config.keyframe_m or swath_width(strips) / 12.0)
+    width_m = swath_width(strips)
+    keyframes = choose_keyframes(strips, config.keyframe_m or width_m / 12.0)
     ties = tie_fixes(fixes, strips, keyframes, config.graph.drift_m_per_sqrt_km)
     cell_m = config.match.cell_m or default_cell(strips)
-    settled_m = config.settled_m or 0.2 * cell_m
-    solution = solve(keyframes, (), ties, config.graph) if known is None else known.solution
     thin = [thinned(strip, 0.6 * cell_m) for strip in strips]
-    textures = TextureStore(thin, config.match)
-    rounds: list[Round] = [] if known is None else list(known.diagnostics.rounds)
-    squares = config.squares if known is None else config.squares[-1:]
-    found: list[Registration] = []
-    links: list[Link] = []
-    steps: list[HeightStep] = []
-    for number in range(config.rounds or len(squares)):
-        part = squares[min(number, len(squares) - 1)]
-        side_m = max(part * swath_width(strips), least_square_m(cell_m))
-        corrected = on_track(thin, keyframes, solution)
-        results, links = register(
-            corrected, textures, keyframes, solution,
-            enough(find_overlaps(corrected, side_m), len(keyframes)), cell_m,
-            config.match, config.graph, config.widest_search_m, floor, progress,
-            f"registering, round {len(rounds) + 1}",
+    given = _Given(
+        thin, keyframes, ties, TextureStore(thin, config.match), width_m, cell_m, config, floor, progress
+    )  # fmt: skip
+    if known is None:
+        squares, state = config.squares, _State(solve(keyframes, (), ties, config.graph))
+    else:
+        squares = config.squares[-1:]
+        state = _State(
+            known.solution, known.diagnostics.rounds, known.registrations,
+            tuple(zip(known.squares, known.links, strict=True)), known.steps,
         )  # fmt: skip
-        steps = height_steps(corrected, keyframes, solution, links)
-        after = solve(keyframes, links, ties, config.graph, steps=steps)
-        used = iter(after.link_used)
-        found = [Registration(w, m, bool(next(used)) if m.accepted else False) for w, m in results]
-        moved = after.correction_m - solution.correction_m
-        moved_m = float(np.sqrt((moved**2).sum(axis=1).mean()))
-        rounds.append(
-            Round(
-                floor="soundings" if floor is None else "map",
-                square_m=side_m,
-                compared=len(found),
-                accepted=len(links),
-                used=sum(r.used for r in found),
-                evidence=float(np.mean([r.match.evidence for r in found])) if found else 0.0,
-                moved_m=moved_m,
-                error_before=after.error_before,
-                error_after=after.error_after,
-            )
-        )
-        logger.info("round %d: %s", len(rounds), rounds[-1])
-        solution = after
-        if not found or (number >= len(squares) and moved_m < settled_m):
+    settled_m = config.settled_m or 0.2 * cell_m
+    for number in range(config.rounds or len(squares)):
+        last = number >= len(squares) - 1
+        state = _round(given, state, squares[min(number, len(squares) - 1)], last, known)
+        if not state.found or (number >= len(squares) and state.rounds[-1].moved_m < settled_m):
             break
+    chosen = apart(state.pool)
+    links = [link for _, link in chosen]
+    solution = state.solution
     if links:
-        solution = solve_shared(keyframes, links, ties, config.graph, steps)
-    return assemble(strips, keyframes, solution, found, links, ties, steps, rounds, config)
+        solution = solve_shared(keyframes, links, ties, config.graph, state.steps)
+    return assemble(
+        strips, keyframes, solution, state.found, links, [w for w, _ in chosen], ties, state.steps,
+        state.rounds, config,
+    )  # fmt: skip
+
+
+def _round(
+    given: _Given, state: _State, part: float, last: bool, known: CorrectedSurvey | None
+) -> _State:
+    """Compare squares of `part` of a swath on the track so far, and solve the graph of what matched."""
+    config, keyframes = given.config, given.keyframes
+    side_m = max(part * given.width_m, least_square_m(given.cell_m))
+    corrected = on_track(given.thin, keyframes, state.solution)
+    results, links = register(
+        corrected, given.textures, keyframes, state.solution,
+        _worth_comparing(find_overlaps(corrected, side_m), state, len(keyframes), last, known),
+        square_cell_m(side_m, given.cell_m), config.match, config.graph, config.widest_search_m,
+        given.floor, given.progress, f"registering, round {len(state.rounds) + 1}",
+    )  # fmt: skip
+    steps = height_steps(corrected, keyframes, state.solution, links)
+    after = solve(keyframes, links, given.ties, config.graph, steps=steps)
+    used = iter(after.link_used)
+    found = tuple(Registration(w, m, bool(next(used)) if m.accepted else False) for w, m in results)
+    moved = after.correction_m - state.solution.correction_m
+    said = Round(
+        floor="soundings" if given.floor is None else "map",
+        square_m=side_m,
+        compared=len(found),
+        accepted=len(links),
+        used=sum(r.used for r in found),
+        evidence=float(np.mean([r.match.evidence for r in found])) if found else 0.0,
+        moved_m=float(np.sqrt((moved**2).sum(axis=1).mean())),
+        error_before=after.error_before,
+        error_after=after.error_after,
+    )
+    logger.info("round %d: %s", len(state.rounds) + 1, said)
+    believed_here = zip((r.window for r in found if r.match.accepted), links, strict=True)
+    kept = tuple(x for x, ok in zip(believed_here, after.link_used, strict=True) if ok)
+    return _State(after, (*state.rounds, said), found, (*state.pool, *kept), tuple(steps))
+
+
+def _worth_comparing(
+    windows: list[Window], state: _State, keyframes: int, last: bool, known: CorrectedSurvey | None
+) -> list[Window]:
+    """Return the windows to compare: fewer where they only narrow the next round's search."""
+    if known is None:
+        before = [(r.window, r.match) for r in state.found]
+        return enough(windows, keyframes // (2 if last else 4), before)
+    # The same squares as before, whose likeness is weighed against these (`gain_in_likeness`).
+    places = {_place(r.window) for r in known.registrations}
+    same = [w for w in windows if _place(w) in places]
+    return same or enough(windows, keyframes // 2)
+
+
+def _place(window: Window) -> tuple[int, int, float, float]:
+    return window.first, window.second, window.easting_m, window.northing_m
 
 
 def tie_to_map(
@@ -237,7 +293,7 @@ def tie_to_map(
     solution = solve_shared(keyframes, corrected.links, every, config.graph, corrected.steps)
     shift_m = (solution.correction_m - before.correction_m).mean(axis=0)
     tied = assemble(
-        strips, keyframes, solution, corrected.registrations, corrected.links, every,
+        strips, keyframes, solution, corrected.registrations, corrected.links, corrected.squares, every,
         corrected.steps, said.rounds, config,
     )  # fmt: skip
     own = len(corrected.ties)
@@ -252,20 +308,6 @@ def tie_to_map(
             prior_shift_m=(float(shift_m[0]), float(shift_m[1])),
         ),
     )
-
-
-# Small surveys compare every square; large ones about one a keyframe, evenly spread: twice as many would
-# narrow the track by a few per cent only (docs/pose-graph.md).
-_ALL_SQUARES = 2000
-
-
-def enough(windows: Sequence[Window], keyframes: int) -> list[Window]:
-    """Return the windows that are worth their time: all of a small survey's, an even choice of a large one's."""
-    most = max(_ALL_SQUARES, keyframes)
-    if len(windows) <= most:
-        return list(windows)
-    chosen = np.linspace(0, len(windows) - 1, most).round().astype(int)
-    return [windows[i] for i in chosen]
 
 
 def gain_in_likeness(before: CorrectedSurvey, after: CorrectedSurvey) -> float:
@@ -284,70 +326,13 @@ def gain_in_likeness(before: CorrectedSurvey, after: CorrectedSurvey) -> float:
     return new.evidence / old.evidence - 1.0
 
 
-def check(strips: Sequence[ElevationStrip]) -> None:
-    """Refuse strips that cannot be one survey.
-
-    Raises
-    ------
-    InputError
-        No strip, several coordinate systems, or places far apart.
-    """
-    if not strips:
-        raise InputError("the survey holds no strip; was a pass of ten pings or more found?")
-    names = sorted({strip.crs for strip in strips})
-    if len(names) > 1:
-        raise InputError(
-            f"the strips lie in different coordinate systems ({', '.join(names)}); "
-            "give one for all with --crs EPSG:N"
-        )
-    _refuse_two_places(strips)
-
-
-# Surveys with so much empty sea between them make no map of one piece.
-_FAR_M = 50_000.0
-
-
-def _refuse_two_places(strips: Sequence[ElevationStrip]) -> None:
-    """Refuse passes that lie in two places, squares of fifty kilometres having to touch."""
-    squares: dict[tuple[int, int], ElevationStrip] = {}
-    for strip in strips:
-        for line in (0, -1):
-            place = np.array([strip.easting_m[line], strip.northing_m[line]])
-            if np.isfinite(place).all():
-                east, north = np.floor(place / _FAR_M)
-                squares.setdefault((int(east), int(north)), strip)
-    left, reached = set(squares), list(squares)[:1]
-    while reached:
-        square = reached.pop()
-        left.discard(square)
-        reached += [s for s in left if max(abs(s[0] - square[0]), abs(s[1] - square[1])) <= 1]
-    if left:
-        first, other = next(iter(squares.values())), squares[min(left)]
-        apart = np.hypot(
-            first.easting_m[0] - other.easting_m[0], first.northing_m[0] - other.northing_m[0]
-        )
-        raise InputError(
-            f"{other.source or 'a pass'} lies {apart / 1000:.0f} km from {first.source or 'the first'}"
-            "; map surveys of different places (or UTM zones) each by itself"
-        )
-
-
-def swath_width(strips: Sequence[ElevationStrip]) -> float:
-    """Return the median width of what the strips show."""
-    widths = []
-    for strip in strips:
-        seen = (np.isfinite(strip.echo) | np.isfinite(strip.elevation_m)).any(axis=0)
-        if seen.any():
-            widths.append(float(np.ptp(strip.across_m[seen])))
-    return max(float(np.median(widths)), 1.0) if widths else 50.0
-
-
 def assemble(
     strips: Sequence[ElevationStrip],
     keyframes: Keyframes,
     solution: Solution,
     found: Sequence[Registration],
     links: Sequence[Link],
+    squares: Sequence[Window],
     ties: Sequence[KeyframeFix],
     steps: Sequence[HeightStep],
     rounds: Sequence[Round],
@@ -397,4 +382,5 @@ def assemble(
         links=tuple(links),
         ties=tuple(ties),
         steps=tuple(steps),
+        squares=tuple(squares),
     )

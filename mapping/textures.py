@@ -11,10 +11,12 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.ndimage import uniform_filter
 
+from mapping.echo_places import placed_across
 from perception.records import ElevationStrip, FloatArray, Grid
 
-# Channels of a `Texture`, in the order of its last axis; heights ride along, for the offset between strips.
-RELIEF, PORT, STARBOARD, OBJECTS, HEIGHT = range(5)
+# Channels of a `Texture`, in the order of its last axis.
+RELIEF, PORT, STARBOARD, OBJECTS = range(4)
+_CHANNELS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +41,7 @@ class MatchConfig:
 
 @dataclass(frozen=True, slots=True)
 class Texture:
-    """What of a strip can be matched: (n, m, 5) float32 values and weights, zero weight no data.
+    """What of a strip can be matched: (n, m, 4) float32 values and weights, zero weight no data.
 
     `relief_share` is the part of the relief's variance that its own sigma does not explain. `across_m`
     (n, m) is where each cell truly lies to starboard of its line, as far as the floor's height is known.
@@ -68,8 +70,8 @@ def texture(
     """
     config = config or MatchConfig()
     n, m = strip.elevation_m.shape
-    values = np.zeros((n, m, 5), np.float32)
-    weights = np.zeros((n, m, 5), np.float32)
+    values = np.zeros((n, m, _CHANNELS), np.float32)
+    weights = np.zeros((n, m, _CHANNELS), np.float32)
     size = _filter_size(strip, config.highpass_m)
     relief_share = 0.0
     seen = np.isfinite(strip.elevation_m) & np.isfinite(strip.sigma_m) & (strip.sigma_m > 0)
@@ -84,8 +86,6 @@ def texture(
         signal = float(np.average(values[..., RELIEF] ** 2, weights=weight))
         noise = float(np.average(sigma**2, weights=weight))
         relief_share = signal / (signal + noise)
-        values[..., HEIGHT] = np.where(seen, strip.elevation_m, 0.0)
-        weights[..., HEIGHT] = weight
     loud = np.isfinite(strip.echo) & (strip.echo > 0) & ~strip.shadow
     # Power is averaged before the logarithm: single looks have a long tail of darkness in logarithms.
     fine = _filter_size(strip, config.smooth_m, least=1)
@@ -141,31 +141,6 @@ def thinned(strip: ElevationStrip, width_m: float) -> ElevationStrip:
         across_m=np.add.reduceat(strip.across_m, first) / size,
         flags=None if strip.flags is None else np.bitwise_or.reduceat(strip.flags, first, axis=1),
     )
-
-
-def placed_across(strip: ElevationStrip, floor: Grid | None) -> FloatArray:
-    """Return (n, m) the signed ground range at which each cell's slant range meets the floor.
-
-    With altitude a, flat ground range x and the floor h above that beneath the line, the slant range is
-    sqrt(x^2 + a^2) and the true ground range sqrt(x^2 + a^2 - (a - h)^2): a hill is drawn towards the track
-    by h a / x, from every side towards another place. Unknown floor counts as level.
-    """
-    flat = np.broadcast_to(strip.across_m.astype(np.float32), strip.echo.shape)
-    if floor is None:
-        return np.ascontiguousarray(flat)
-    altitude = np.nan_to_num(strip.altitude_m)[:, None]
-    beneath = floor.sample(strip.easting_m, strip.northing_m)[:, None]
-    placed = flat
-    # The floor is first read at the flat place, then where that puts the cell: twice is within a cell.
-    for _ in range(2):
-        c, s = np.cos(strip.heading_rad)[:, None], np.sin(strip.heading_rad)[:, None]
-        height = floor.sample(
-            strip.easting_m[:, None] + c * placed, strip.northing_m[:, None] - s * placed
-        )
-        rise = np.clip(np.nan_to_num(height - beneath), -2.0 * altitude, 0.8 * altitude)
-        squared = flat**2 + 2.0 * altitude * rise - rise**2
-        placed = np.sign(flat) * np.sqrt(np.maximum(squared, 0.0))
-    return np.asarray(placed, np.float32)
 
 
 def _filter_size(strip: ElevationStrip, width_m: float, least: int = 3) -> tuple[int, int]:
@@ -267,13 +242,13 @@ def scatter(
     cell: float,
     size: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Average a texture's cells into a square grid (5, size, size), row 0 south.
+    """Average a texture's cells into a square grid (4, size, size), row 0 south.
 
     Each datum is shared among the four cells around it: given whole to one cell, a regular lattice of data
     on a regular grid beats, and every match is off by up to half a datum's spacing.
     """
-    total = np.zeros((5, size, size), np.float32)
-    weight = np.zeros((5, size, size), np.float32)
+    total = np.zeros((_CHANNELS, size, size), np.float32)
+    weight = np.zeros((_CHANNELS, size, size), np.float32)
     for i in range(values.shape[0]):
         c, s = np.cos(heading[i]), np.sin(heading[i])
         for j in range(values.shape[1]):
@@ -283,7 +258,7 @@ def scatter(
             if not (0 <= col < size - 1 and 0 <= row < size - 1):
                 continue
             fx, fy = x - col, y - row
-            for k in range(5):
+            for k in range(_CHANNELS):
                 w = weights[i, j, k]
                 if w > 0:
                     for dy in range(2):
@@ -291,7 +266,7 @@ def scatter(
                             part = w * (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
                             total[k, row + dy, col + dx] += part * values[i, j, k]
                             weight[k, row + dy, col + dx] += part
-    for k in range(5):
+    for k in range(_CHANNELS):
         for row in range(size):
             for col in range(size):
                 if weight[k, row, col] > 0:
@@ -302,14 +277,14 @@ def scatter(
 def gather(
     texture: Texture, corner: tuple[float, float], cell_m: float, size: int
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return the texture on the square's grid (5, size, size), its weights, and its mean heading."""
+    """Return the texture on the square's grid (4, size, size), its weights, and its mean heading."""
     strip = texture.strip
     half = 0.5 * size * cell_m
     east, north = strip.easting_m - corner[0] - half, strip.northing_m - corner[1] - half
     along = np.abs(east * np.sin(strip.heading_rad) + north * np.cos(strip.heading_rad))
     near = along < 1.5 * half
     if not near.any():
-        nothing = np.zeros((5, size, size), np.float32)
+        nothing = np.zeros((_CHANNELS, size, size), np.float32)
         return nothing, nothing.copy(), 0.0
     rows = slice(int(np.argmax(near)), len(near) - int(np.argmax(near[::-1])))
     values, weights = scatter(

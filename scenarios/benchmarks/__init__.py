@@ -19,6 +19,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "sonar-files": ("sonar_files", "reading sonar files: pings a second, memory at 1x and 10x"),
     "echoes": ("echoes", "echoes to strips: pings a minute, heights of objects against truth"),
     "mapping": ("mapping", "one map from many passes: registration, pose graph, gridding, peers"),
+    "mapping-large": (
+        "mapping_large",
+        "a hundred passes registered and solved: time, memory, track against the truth",
+    ),
     "crossed": ("crossed", "three and three crossed passes that drift, echoes to map and track"),
     "gridding": ("gridding", "ten million soundings into cells, beside bincount, verde and GMT"),
     "tiles": ("tiles", "a map that outgrows memory: memory against size, the slowest step"),

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from mapping.fixes import PositionFix
-from mapping.overlaps import Window
 from mapping.pose_graph import GraphConfig
-from mapping.survey import SurveyConfig, correct_survey, enough
+from mapping.survey import SurveyConfig, correct_survey
 from perception.records import InputError
 from tests.mapping.worlds import Drift, Flight, fly, make_world
 
@@ -123,12 +122,3 @@ def test_passes_in_two_places_are_refused_and_a_long_line_of_them_is_not(
         correct_survey([strip, far])
     between = [replace(strip, easting_m=strip.easting_m + 45_000.0 * n) for n in range(10)]
     assert len(correct_survey([*between, far], config=SurveyConfig(rounds=1)).strips) == 11
-
-
-def test_a_large_survey_compares_an_even_choice_of_its_squares() -> None:
-    windows = [Window(0, 1, 30.0 * i, 0.0, 30.0, 0.0, 0.0, 1.0) for i in range(10_000)]
-    assert enough(windows[:1500], 100) == windows[:1500]
-    chosen = enough(windows, 4000)
-    assert len(chosen) == 4000 and chosen[0] is windows[0] and chosen[-1] is windows[-1]
-    gaps = np.diff([w.easting_m for w in chosen]) / 30.0
-    assert set(gaps.tolist()) == {2.0, 3.0}
