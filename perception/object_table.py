@@ -84,7 +84,7 @@ class ObjectTable:
 
 @dataclass(frozen=True, slots=True)
 class ObjectRow:
-    """One object; attributes as in `ObjectTable`."""
+    """One object; attributes as in `ObjectTable`, and its `odds` before the pass's other shadows are known."""
 
     easting_m: float
     northing_m: float
@@ -103,6 +103,7 @@ class ObjectRow:
     gain: float = field(default=0.0)
     probability: float = field(default=1.0)
     lower_bound: bool = field(default=False)
+    odds: float = field(default=float("inf"))
 
 
 def write_objects_csv(path: Path, table: ObjectTable) -> None:

@@ -8,7 +8,7 @@ pings stands in, with a wider sigma. What the floor's own relief may have cast i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from perception.object_table import ObjectRow, ObjectTable, write_objects_csv
 from perception.records import FloatArray, IntArray
 from perception.shadow_marks import Shadow, Track, darkness, find_shadows, order_evidence
 from perception.shadows import crater_depth, crater_sigma, hill_height, hill_sigma
-from perception.standing import object_probability
+from perception.standing import object_odds, probabilities
 
-__all__ = ["ObjectConfig", "ObjectRow", "ObjectTable", "Track", "find_objects", "write_objects_csv"]
+__all__ = [
+    "ObjectConfig", "ObjectRow", "ObjectTable", "Track", "find_objects", "listed_objects", "write_objects_csv",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ class ObjectConfig:
     min_pings: int = 2
     min_cells: int = 20
     min_gain: float = 30.0
-    min_probability: float = 0.4
+    min_probability: float = 0.5
     shape_sigma: float = 0.03
     fits: int = 30
     fits_per_ping: float = 0.025
@@ -56,8 +58,8 @@ class ObjectConfig:
     beam_deg: float = 0.7
 
 
-# The footprint is known after the fit alone; before it a shadow this unlikely is given up.
-_HOPELESS = 0.1
+# The footprint is known after the fit alone; before it a shadow of smaller odds is given up, whatever adjoins it.
+_HOPELESS, _EVEN_SIGMA = 0.11, 3.0
 # Beyond this many standard deviations the order of levels alone settles the kind; below, each counts for this
 # much log likelihood.
 _SURE_ORDER, _ORDER_WEIGHT = 3.0, 3.0
@@ -109,7 +111,7 @@ def find_objects(
     roughness: Roughness | None = None,
     config: ObjectConfig | None = None,
 ) -> list[ObjectRow]:
-    """Find the objects and craters of one side of a pass.
+    """Find what may be objects and craters of one side of a pass; `listed_objects` says what is listed.
 
     Parameters
     ----------
@@ -136,9 +138,20 @@ def find_objects(
         if not fitted and shadow.cells < config.plain_cells:
             continue
         row = _measure(shadow, fitted, seen)
-        if row is not None and row.probability >= config.min_probability:
+        if row is not None:
             rows.append(_placed(row, side, track, pass_index))
     return rows
+
+
+def listed_objects(rows: list[ObjectRow], config: ObjectConfig | None = None) -> list[ObjectRow]:
+    """Return the candidates of one pass (both sides) that are likelier objects than relief, in order of pings."""
+    config = config or ObjectConfig()
+    told = probabilities(np.array([row.odds for row in rows]))
+    likely = [replace(row, probability=float(p)) for row, p in zip(rows, told, strict=True)]
+    return sorted(
+        (row for row in likely if row.probability >= config.min_probability),
+        key=lambda row: row.ping,
+    )
 
 
 def _measure(shadow: Shadow, fitted: bool, seen: _Side) -> ObjectRow | None:
@@ -151,7 +164,7 @@ def _measure(shadow: Shadow, fitted: bool, seen: _Side) -> ObjectRow | None:
     dark = darkness(shadow, seen.marks, seen.ratio)
     _, half = shadow.along_extent(seen.track)
     proved = edges.proved_m(hill=order > -_SURE_ORDER)
-    if object_probability(proved, 0.7 * half, dark, seen.roughness) < _HOPELESS:
+    if object_odds(proved, 0.7 * half, dark, _EVEN_SIGMA, seen.roughness) < _HOPELESS:
         return None
     fit = None
     # What a shadow without an end proves is a least height: no shape can be read from it.
@@ -160,9 +173,8 @@ def _measure(shadow: Shadow, fitted: bool, seen: _Side) -> ObjectRow | None:
         if fit is not None and fit.gain < config.min_gain:
             return None
     if fit is not None and _explains(fit, shadow, edges, seen.track):
-        return _of_fit(fit, edges, len(shadow.core), dark, seen)
-    # Beyond the swath's edge no highlight could be seen: a shadow that leaves it counts as a hill's.
-    return _of_shadow(shadow, shadow.open or order > 0, edges, dark, _fitted_half_m(fit), seen)
+        return _of_fit(fit, edges, len(shadow.core), (dark, order), seen)
+    return _of_shadow(shadow, edges, (dark, order), _fitted_half_m(fit), seen)
 
 
 def _edges(shadow: Shadow, seen: _Side) -> _Edges:
@@ -209,7 +221,10 @@ def _explains(fit: BumpFit, shadow: Shadow, edges: _Edges, track: Track) -> bool
     )
 
 
-def _of_fit(fit: BumpFit, edges: _Edges, pings: int, dark: float, seen: _Side) -> ObjectRow:
+def _of_fit(
+    fit: BumpFit, edges: _Edges, pings: int, look: tuple[float, float], seen: _Side
+) -> ObjectRow:
+    """Return the row of a fitted shape; `look` is the shadow's darkness and its order of levels."""
     x0, y0, _, log_sx, log_sy, log_beta = fit.parameters[:6]
     height, drop = fit.height_m, edges.drop_m
     beta = float(np.exp(log_beta))
@@ -232,7 +247,7 @@ def _of_fit(fit: BumpFit, edges: _Edges, pings: int, dark: float, seen: _Side) -
         slant_range_m=edges.start_m, shadow_length_m=edges.length_m, pass_index=0, ping=0,
         across_m=float(x0), along_m=float(y0), half_across_m=half_across, half_along_m=half_along,
         shape=beta, gain=fit.gain,
-        probability=object_probability(edges.proved_m(hill), half, dark, seen.roughness),
+        odds=object_odds(edges.proved_m(hill), half, *look, seen.roughness),
     )  # fmt: skip
 
 
@@ -256,12 +271,15 @@ def _fitted_half_m(fit: BumpFit | None) -> float:
 
 
 def _of_shadow(
-    shadow: Shadow, hill: bool, edges: _Edges, dark: float, land_m: float, seen: _Side
+    shadow: Shadow, edges: _Edges, look: tuple[float, float], land_m: float, seen: _Side
 ) -> ObjectRow:
     """Measure by the paper's relation: order of levels for the kind, the longest shadow for the height.
 
-    `land_m` is the half size of what the fit took the shadow for; relief of that size may have cast it.
+    `look` is the shadow's darkness and its order of levels; `land_m` the half size of what the fit took the shadow
+    for; relief of that size may have cast it.
     """
+    # Beyond the swath's edge no highlight could be seen: a shadow that leaves it counts as a hill's.
+    hill = shadow.open or look[1] > 0
     height = edges.proved_m(hill)
     spread = hill_sigma if hill else crater_sigma
     sigma = float(
@@ -285,7 +303,7 @@ def _of_shadow(
         sigma_m=sigma, slant_range_m=edges.start_m, shadow_length_m=edges.length_m,
         pass_index=0, ping=0, across_m=x_start if hill else 0.5 * (x_start + x_end),
         along_m=middle, half_across_m=half_across, half_along_m=half, lower_bound=shadow.open,
-        probability=object_probability(height, land_m, dark, seen.roughness),
+        odds=object_odds(height, land_m, *look, seen.roughness),
     )  # fmt: skip
 
 
@@ -298,15 +316,16 @@ def _placed(row: ObjectRow, side: int, track: Track, pass_index: int) -> ObjectR
     ahead = row.along_m - track.along_m[line]
     heading = float(track.heading_rad[line])
     course = _course(track, line)
-    values = {f.name: getattr(row, f.name) for f in fields(row)}
-    values |= {
-        "easting_m": float(track.easting_m[line] + np.cos(heading) * across + np.sin(course) * ahead),
-        "northing_m": float(track.northing_m[line] - np.sin(heading) * across + np.cos(course) * ahead),
-        "across_m": across,
-        "ping": int(track.ping[line]),
-        "pass_index": pass_index,
-    }  # fmt: skip
-    return ObjectRow(**values)
+    return replace(
+        row,
+        easting_m=float(track.easting_m[line] + np.cos(heading) * across + np.sin(course) * ahead),
+        northing_m=float(
+            track.northing_m[line] - np.sin(heading) * across + np.cos(course) * ahead
+        ),
+        across_m=across,
+        ping=int(track.ping[line]),
+        pass_index=pass_index,
+    )
 
 
 def _course(track: Track, line: int) -> float:

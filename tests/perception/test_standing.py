@@ -10,7 +10,7 @@ import numpy as np
 from perception.contours import Roughness
 from perception.objects import write_objects_csv
 from perception.records import FloatArray
-from perception.standing import object_probability
+from perception.standing import object_odds, probabilities
 from perception.strips import build_strip
 from tests.perception.echo_fixtures import Height, Survey, box, gaussian, make_swath
 
@@ -55,14 +55,38 @@ def test_a_boulder_on_relief_is_still_found() -> None:
     assert abs(table.height_m[found] - 1.5) < 3 * table.sigma_m[found]
 
 
-def test_probability_rises_with_height_and_darkness_and_falls_with_roughness() -> None:
+def test_odds_rise_with_height_darkness_and_highlight_and_fall_with_roughness() -> None:
     rough, smooth = Roughness(0.01, 1.5), Roughness(0.0004, 1.5)
-    usual = object_probability(1.0, 1.5, 0.05, rough)
-    assert object_probability(1.5, 1.5, 0.05, rough) > usual
-    assert object_probability(1.0, 1.5, 0.03, rough) > usual
-    assert object_probability(1.0, 3.0, 0.05, rough) < usual
-    assert object_probability(1.0, 1.5, 0.05, smooth) > 0.99
-    assert object_probability(1.0, 1.5, 0.05, None) == 1.0
+    usual = object_odds(1.0, 1.5, 0.05, 5.0, rough)
+    assert object_odds(1.5, 1.5, 0.05, 5.0, rough) > usual
+    assert object_odds(1.0, 1.5, 0.03, 5.0, rough) > usual
+    assert object_odds(1.0, 3.0, 0.05, 5.0, rough) < usual
+    assert object_odds(1.0, 1.5, 0.05, 1.0, rough) < usual
+    # A crater's highlight comes after its shadow and speaks for it as much.
+    assert object_odds(1.0, 1.5, 0.05, -5.0, rough) == usual
+    assert object_odds(1.0, 1.5, 0.05, 5.0, smooth) > 99
+    assert object_odds(1.0, 1.5, 0.05, 5.0, None) > 1e5
+
+
+def test_doubtful_shadows_are_likelier_objects_among_sure_ones_than_among_doubtful_ones() -> None:
+    doubtful, sure = np.full(20, 0.7), np.full(20, 50.0)
+    alone = probabilities(doubtful)
+    among = probabilities(np.concatenate([doubtful[:1], sure]))
+    assert alone.max() < 0.35 and among[0] > 0.6
+    # One shadow alone is judged as itself, nearly.
+    assert abs(probabilities(np.array([1.0]))[0] - 0.5) < 1e-6
+    assert len(probabilities(np.array([]))) == 0
+
+
+def test_the_share_of_objects_is_found_again() -> None:
+    """Odds drawn from the two populations that they tell apart: their probabilities come true."""
+    rng = np.random.default_rng(5)
+    true = rng.uniform(size=4000) < 0.2
+    evidence = rng.normal(np.where(true, 1.0, -1.0), np.sqrt(2.0))
+    told = probabilities(np.exp(evidence))
+    assert abs(told.mean() - 0.2) < 0.03
+    sure = told > 0.6
+    assert abs(true[sure].mean() - told[sure].mean()) < 0.06
 
 
 def test_a_shadow_that_leaves_the_swath_gives_a_least_height(tmp_path: Path) -> None:
