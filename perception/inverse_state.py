@@ -39,7 +39,7 @@ class InversionConfig:
     max_cells : nodes beyond which a cell that was not asked for is enlarged.
     """
 
-    iterations: int = 6
+    iterations: int = 7
     exponent: float = 2.0
     least_sigma: float = 0.2
     albedo_sigma: float = 0.35
@@ -103,7 +103,7 @@ class Solved:
 
 
 def linear_problem(
-    state: State, data: Data | None, equations: Equations, caution: float = 4.0
+    state: State, data: Data | None, equations: Equations, caution: float = 0.0
 ) -> Problem:
     """Return the linear problem; `caution` is the weight of the present surface beside the prior."""
     none = np.zeros(0)

@@ -20,8 +20,6 @@ from perception.soundings import Equations, bilinear_rows
 
 # Looks whose mean direction has at least this length come from one side (1 = all from one direction).
 _ONE_SIDED = 0.8
-# Mean length of the doubled directions below which looks cross (0 = at right angles, evenly).
-_CROSSING = 0.8
 _STRETCH_CELLS = 4
 
 
@@ -34,19 +32,6 @@ def one_sided(rows: Rows, shape: tuple[int, int]) -> BoolArray:
     north = np.bincount(rows.cell, rows.c_north / length, minlength=duals)
     mean = np.hypot(east, north) / np.maximum(count, 1)
     return ((count > 0) & (mean > _ONE_SIDED)).reshape(shape[0] - 1, shape[1] - 1)
-
-
-def crossing(rows: Rows, shape: tuple[int, int]) -> BoolArray:
-    """Return (duals,), True where looks at a cell come along directions that cross."""
-    duals = (shape[0] - 1) * (shape[1] - 1)
-    length = np.maximum(np.hypot(rows.c_east, rows.c_north), 1e-9)
-    east, north = rows.c_east / length, rows.c_north / length
-    # Twice the azimuth makes opposite directions one.
-    count = np.maximum(np.bincount(rows.cell, minlength=duals), 1)
-    cosine = np.bincount(rows.cell, north**2 - east**2, minlength=duals) / count
-    sine = np.bincount(rows.cell, 2 * east * north, minlength=duals) / count
-    lit = np.bincount(rows.cell, minlength=duals) > 1
-    return lit & (np.hypot(cosine, sine) < _CROSSING)
 
 
 def mean_profiles(

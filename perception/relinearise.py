@@ -18,7 +18,7 @@ from perception.inverse_state import (
     sounding_surface,
 )
 from perception.occlusion import dark_samples, shadow_equations
-from perception.profiles import crossing, mean_profiles, one_sided
+from perception.profiles import mean_profiles, one_sided
 from perception.records import BoolArray, FloatArray, Progress
 from perception.shading import Rows, trace
 from perception.soundings import Equations, both, mean_soundings
@@ -36,9 +36,8 @@ _ONE_SIDED_PART = 0.1
 
 
 # Steps about a surface without detail, that settle the mean profiles; 1-sigma of those afterwards.
-_SMOOTH_STEPS = 4
-_PROFILE_M = 0.02
-_LOOSE_PROFILE_M = 0.1
+_SMOOTH_STEPS = 3
+_PROFILE_M = 0.2
 
 
 def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generator) -> Solved:
@@ -61,11 +60,11 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
         if state.base is None:
             # Once the first returns' lead is known: the surface of the soundings alone.
             state.base = sounding_surface(state)
-        held = mean_soundings(equations, state.soundings)
+        held = mean_soundings(equations, state.soundings, float(np.mean(state.lead_m)))
         if alone:
             held = both(_sounding_profiles(state, state.base, single), held)
         elif state.first is not None:
-            held = both(held, _first_profiles(state, state.first, rows, passed))
+            held = both(held, _first_profiles(state, state.first, passed))
         if k > 0 and state.config.shadows:
             equations = both(
                 equations,
@@ -128,18 +127,14 @@ def _sounding_profiles(state: State, base: FloatArray, single: BoolArray) -> Equ
     return mean_profiles(*frame, single, max(0.1 * spread, 0.02))
 
 
-def _first_profiles(state: State, first: FloatArray, rows: Rows, lit: BoolArray) -> Equations:
+def _first_profiles(state: State, first: FloatArray, lit: BoolArray) -> Equations:
     """Return the mean profiles across the tracks as the steps about a smooth floor found them.
 
-    About a smooth floor mean slope and mean log power are in proportion. On a rough one the cells that a sonar
-    sees are those that face it, and a profile found there creeps upwards, step by step, at the cost of a gain that
-    nothing contradicts: 0.1 to 0.4 m in five steps on independent simulations. Tracks that cross
-    contradict it, so there the hold is loose.
+    About a smooth floor mean slope and mean log power are in proportion. Held loosely: detail seen from two sides
+    tells more of the profile, and where there is little, the hold keeps a step from running along what gain leaves free.
     """
-    crossed = float(np.sum(crossing(rows, state.shape))) > 0.1 * np.unique(rows.cell).size
     frame = (first, state.west_m, state.south_m, state.cell_m, state.rays)
-    sigma = _LOOSE_PROFILE_M if crossed else _PROFILE_M
-    return mean_profiles(*frame, lit, sigma, relative=True)
+    return mean_profiles(*frame, lit, _PROFILE_M, relative=True)
 
 
 def _without_detail(state: State) -> FloatArray:
