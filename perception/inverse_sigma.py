@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from perception.bands import in_threads
 from perception.inverse_state import Solved, State, linear_problem, present_soundings
-from perception.posterior import Problem
+from perception.posterior import Fields, Problem
 from perception.records import FloatArray
 
 # Ground that no two sides see, or that none sees, is known no better than this part of the soundings' sigma: one
@@ -16,7 +17,9 @@ from perception.records import FloatArray
 _ONE_SIDED_PART = 0.7
 # Long waves are few among the unknowns and hold nearly all of the spread: they are solved to a sigma in all, not
 # to a part of the whole.
-_TOLERANCE = 1.0
+_TOLERANCE = 0.5
+# Samples in hand together: threads share them, and memory holds no more.
+_AT_ONCE = 4
 
 
 def spread(state: State, solved: Solved, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -28,11 +31,16 @@ def spread(state: State, solved: Solved, rng: np.random.Generator) -> tuple[Floa
 
 
 def _sample_sigma(problem: Problem, state: State, rng: np.random.Generator) -> FloatArray:
+    zero = (np.zeros(state.shape), np.zeros(state.shape), np.zeros(state.basis.size))
+
+    def height(right: Fields) -> FloatArray:
+        return problem.solve(zero, right, _TOLERANCE)[0][0]
+
     total = np.zeros(state.shape)
-    for _ in range(state.config.samples):
-        zero = (np.zeros(state.shape), np.zeros(state.shape), np.zeros(state.basis.size))
-        solution, _ = problem.solve(zero, problem.perturbation(rng), _TOLERANCE)
-        total += solution[0] ** 2
+    for drawn in range(0, state.config.samples, _AT_ONCE):
+        count = min(_AT_ONCE, state.config.samples - drawn)
+        for solution in in_threads(height, [problem.perturbation(rng) for _ in range(count)]):
+            total += solution**2
     # Few samples: neighbours lend theirs, the spread varies slowly.
     return np.sqrt(ndimage.uniform_filter(total / state.config.samples, 7, mode="nearest"))
 

@@ -77,19 +77,22 @@ def invert(
     rng = rng or np.random.default_rng(0)
     if not looks:
         raise InputError("no pass to invert; give at least one")
-    state = _prepare(looks, cell_m, config, rng)
+    survey = _survey(looks, cell_m, config)
     total = config.iterations + 3
     progress("joint inversion", 1, total)
-    if state.surface.size > config.nodes_at_once:
+    if survey.shape[0] * survey.shape[1] > config.nodes_at_once:
         # Large maps take their first steps on cells twice as wide, at a quarter of the cost.
-        coarse = _prepare(looks, 2 * state.cell_m, config, rng)
+        coarse = _learn(_survey(looks, 2 * survey.cell_m, config), config, rng)
         solved = iterate(coarse, config.iterations - 1, progress, rng)
         deviation, base_sigma = spread(coarse, solved, rng)
-        _hand_down(coarse, state)
-        last = iterate(state, 2, progress, rng)
+        state = _handed_down(coarse, survey)
         deviation = _resample(deviation, coarse, state)
         base_sigma = _resample(base_sigma, coarse, state)
+        # Rays and rows of the wide cells have had their say; the finest grid needs their room.
+        del coarse, solved
+        last = iterate(state, 2, progress, rng)
     else:
+        state = _learn(survey, config, rng)
         last = iterate(state, config.iterations, progress, rng)
         deviation, base_sigma = spread(state, last, rng)
     progress("joint inversion", total, total)
@@ -97,12 +100,19 @@ def invert(
     return _result(state, sigma, last, crs or looks[0].swath.crs)
 
 
-def _prepare(
-    looks: Sequence[Look],
-    cell_m: float | None,
-    config: InversionConfig,
-    rng: np.random.Generator,
-) -> State:
+@dataclass(frozen=True, slots=True)
+class _Survey:
+    """The echoes and soundings on one frame of nodes, before anything is learned of them."""
+
+    west_m: float
+    south_m: float
+    cell_m: float
+    shape: tuple[int, int]
+    rays: list[Rays]
+    bottoms: list[Soundings]
+
+
+def _survey(looks: Sequence[Look], cell_m: float | None, config: InversionConfig) -> _Survey:
     cell = cell_m or _natural_cell(looks)
     rays = of_unit_level([ray for i, look in enumerate(looks) for ray in stack_rays(look, i, cell)])
     if not rays:
@@ -125,17 +135,29 @@ def _prepare(
         while shape[0] * shape[1] > config.max_cells:
             cell *= 2
             west, south, shape = _frame(rays, bottoms, cell)
-    bottom = join(bottoms)
-    roughness = learn_roughness(bottoms, float(np.median(bottom.sigma_m)) / 2, cell, rng)
-    reach = max((ray.reach_m for ray in rays), default=1.0)
-    basis = GainBasis(reach)
-    mean = float(np.mean(bottom.up_m - bottom.range_m))
-    state = State(
-        west, south, cell, shape, rays, bottom, roughness, _albedo_prior(config), basis, mean,
-        np.full(shape, mean), np.zeros(shape), np.zeros(basis.size), config,
-    )  # fmt: skip
+    return _Survey(west, south, cell, shape, rays, bottoms)
+
+
+def _learn(survey: _Survey, config: InversionConfig, rng: np.random.Generator) -> State:
+    """Return the state to start from: the roughness and the surface that the soundings tell."""
+    bottom = join(survey.bottoms)
+    noise = float(np.median(bottom.sigma_m)) / 2
+    roughness = learn_roughness(survey.bottoms, noise, survey.cell_m, rng)
+    state = _state(survey, bottom, roughness, config)
     state.surface = sounding_surface(state)
     return state
+
+
+def _state(
+    survey: _Survey, bottom: Soundings, roughness: Spectrum, config: InversionConfig
+) -> State:
+    basis = GainBasis(max((ray.reach_m for ray in survey.rays), default=1.0))
+    mean = float(np.mean(bottom.up_m - bottom.range_m))
+    return State(
+        survey.west_m, survey.south_m, survey.cell_m, survey.shape, survey.rays, bottom, roughness,
+        _albedo_prior(config), basis, mean, np.full(survey.shape, mean), np.zeros(survey.shape),
+        np.zeros(basis.size), config,
+    )  # fmt: skip
 
 
 def _natural_cell(looks: Sequence[Look]) -> float:
@@ -190,18 +212,20 @@ def _resample(values: FloatArray, source: State, target: State) -> FloatArray:
     return np.asarray(ndimage.map_coordinates(values, [r, c], order=1, mode="nearest"))
 
 
-def _hand_down(coarse: State, fine: State) -> None:
-    """Let the fine problem start where the coarse one ended."""
+def _handed_down(coarse: State, survey: _Survey) -> State:
+    """Return the state of narrower cells that starts where the wider ones ended."""
+    fine = _state(survey, join(survey.bottoms), coarse.roughness, coarse.config)
     fine.surface = _resample(coarse.surface, coarse, fine)
     fine.albedo = _resample(coarse.albedo, coarse, fine)
     if coarse.base is not None:
         fine.base = _resample(coarse.base, coarse, fine)
     if coarse.first is not None:
         fine.first = _resample(coarse.first, coarse, fine)
-    fine.gain, fine.roughness = coarse.gain, coarse.roughness
+    fine.gain = coarse.gain
     fine.lead_m, fine.lead_sigma_m = coarse.lead_m, coarse.lead_sigma_m
     # Residuals on other cells do not compare: the fine problem's own decide when it ends.
     fine.step_m = list(coarse.step_m)
+    return fine
 
 
 def _result(state: State, sigma: FloatArray, solved: Solved, crs: str) -> InversionResult:

@@ -1,8 +1,10 @@
-"""Multigrid for the fields of the joint problem: heights and log-albedo on nested grids.
+"""Multigrid for the joint problem: heights, log-albedo and gains on nested grids.
 
 The data of a cell enter as one symmetric 4 x 4 matrix (ten numbers) on (slope east, slope north, mean
-height, mean albedo), whatever the number of looks; a coarser grid's matrix is the sum over its four
-children, which makes a V-cycle cheap.
+height, mean albedo), whatever the number of looks; on a coarser grid as an 8 x 8 matrix on the corners, the sum over its
+four children. On the coarsest grid heights, albedo and gains are solved directly, as one system; on the grids between
+what ties the gains to the fields is kept at every residual (`perception.coupling`), for a gain and a dome between
+tracks explain nearly the same echoes.
 """
 
 from __future__ import annotations
@@ -12,21 +14,28 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import sparse
 
-from perception.records import FloatArray
-from perception.stencils import (
-    apply_data,
-    apply_local,
-    apply_prior,
-    coarsen_local,
-    local_of_moments,
+from perception.bands import over_bands
+from perception.coarse import CoarseSolver, level_matrix
+from perception.coupling import Coupling
+from perception.level_kernels import (
+    advance,
+    apply_corners,
+    apply_features,
+    prolong_rows,
+    restrict_rows,
 )
+from perception.records import FloatArray, IntArray
+from perception.stencils import coarsen_local, local_of_moments
 
+# Nodes that a direct factorisation takes in a fraction of a second.
+COARSEST_NODES = 5000
 # Places of the diagonal in a packed upper triangle of 8 rows.
 _DIAGONAL = [8 * k - k * (k - 1) // 2 for k in range(8)]
 # The diagonally scaled operator has no eigenvalue beyond the number of unknowns that one cell ties together;
 # equations on many nodes enter the diagonal by their absolute row sums, which bound them by one.
 _BOUND = 8.0
 _LANCZOS_STEPS = 10
+_SMOOTHING = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,21 +53,18 @@ class Spectrum:
 
 @dataclass(frozen=True, slots=True)
 class FeatureData:
-    """The data of the finest grid: cells' matrices on features, packed (rows, cols, 10)."""
+    """The data of the finest grid: cells' matrices on features, packed (10, rows, cols)."""
 
     moments: FloatArray
     cell_m: float
 
     @property
     def shape(self) -> tuple[int, int]:
-        return self.moments.shape[0], self.moments.shape[1]
-
-    def add(self, z: FloatArray, a: FloatArray, out_z: FloatArray, out_a: FloatArray) -> None:
-        apply_data(self.moments, z, a, self.cell_m, out_z, out_a)
+        return self.moments.shape[1], self.moments.shape[2]
 
     def diagonal(self) -> FloatArray:
         """Return what each cell adds to the diagonal of its corners' z and a (8, rows, cols)."""
-        m, h = np.moveaxis(self.moments, 2, 0), self.cell_m
+        m, h = self.moments, self.cell_m
         out = np.empty((8, *self.shape))
         for k in range(4):
             e = (1 if k % 2 else -1) / (2 * h)
@@ -68,51 +74,92 @@ class FeatureData:
         out[4:] = m[9] / 16
         return out
 
-    def coarser(self) -> CornerData:
-        return CornerData(coarsen_local(local_of_moments(self.moments, self.cell_m)))
+    def local(self) -> FloatArray:
+        """Return the cells' matrices on their corners, packed (36, rows, cols)."""
+        out = np.zeros((36, *self.shape), np.float32)
+        over_bands(local_of_moments, self.shape[0], out.size, self.moments, self.cell_m, out)
+        return out
 
 
 @dataclass(frozen=True, slots=True)
 class CornerData:
-    """The data of a coarser grid: cells' matrices on their corners' z and a, packed (rows, cols, 36).
+    """The data of a coarser grid: cells' matrices on their corners' z and a, packed (36, rows, cols).
 
     Within a wide cell a bilinear field has gradients that differ from child to child; the four features of its
-    mean would not see that, and the coarse solution would overshoot.
+    mean would not see that, and the coarse solution would overshoot. Single precision: these grids only precondition.
     """
 
-    local: FloatArray
+    packed: FloatArray
 
     @property
     def shape(self) -> tuple[int, int]:
-        return self.local.shape[0], self.local.shape[1]
-
-    def add(self, z: FloatArray, a: FloatArray, out_z: FloatArray, out_a: FloatArray) -> None:
-        apply_local(self.local, z, a, out_z, out_a)
+        return self.packed.shape[1], self.packed.shape[2]
 
     def diagonal(self) -> FloatArray:
         """Return what each cell adds to the diagonal of its corners' z and a (8, rows, cols)."""
-        return np.moveaxis(self.local[:, :, _DIAGONAL], 2, 0)
+        return np.asarray(self.packed[_DIAGONAL], float)
 
-    def coarser(self) -> CornerData:
-        return CornerData(coarsen_local(self.local))
+    def local(self) -> FloatArray:
+        return self.packed
+
+
+def coarser(data: FeatureData | CornerData) -> CornerData:
+    """Return the data on cells twice as wide: exact for bilinear fields."""
+    rows, cols = data.shape
+    out = np.zeros((36, rows // 2, cols // 2), np.float32)
+    over_bands(coarsen_local, rows // 2, out.size, data.local(), out)
+    return CornerData(out)
+
+
+@dataclass(frozen=True, slots=True)
+class Tie:
+    """Linear equations on few of the nodes: a matrix on those alone, and its transpose."""
+
+    matrix: sparse.csr_matrix
+    weight: FloatArray
+    nodes: IntArray
+    read: sparse.csr_matrix = field(init=False)
+    spread: sparse.csr_matrix = field(init=False)
+
+    @classmethod
+    def of(cls, matrix: sparse.csr_matrix, weight: FloatArray) -> Tie:
+        # In order now: `read` shares its values, which a sorting later on would move under it.
+        matrix.sum_duplicates()
+        return cls(matrix, weight, np.unique(matrix.indices))
+
+    def __post_init__(self) -> None:
+        place = np.searchsorted(self.nodes, self.matrix.indices)
+        read = sparse.csr_matrix(
+            (self.matrix.data, place, self.matrix.indptr),
+            shape=(self.matrix.shape[0], len(self.nodes)),
+        )
+        object.__setattr__(self, "read", read)
+        object.__setattr__(self, "spread", sparse.csr_matrix(read.T))
+
+    def add(self, z: FloatArray, out: FloatArray) -> None:
+        """Add the equations' normal matrix applied to `z`."""
+        if len(self.nodes):
+            at = self.read @ z.ravel()[self.nodes]
+            out.reshape(-1)[self.nodes] += self.spread @ (self.weight * at)
+
+    def coarser(self, nodes: tuple[int, int]) -> Tie:
+        return Tie.of(sparse.csr_matrix(self.matrix @ prolongation_matrix(*nodes)), self.weight)
 
 
 @dataclass(slots=True)
 class Level:
-    """One grid of the hierarchy with its operator."""
+    """One grid of the hierarchy with its operator on (heights, albedo)."""
 
     cell_m: float
     data: FeatureData | CornerData
     height: Spectrum
     albedo: Spectrum
-    rows: sparse.csr_matrix
-    row_weight: FloatArray
+    tie: Tie
+    coupling: Coupling | None = None
     diagonal: tuple[FloatArray, FloatArray] = field(init=False)
     largest: float = field(init=False)
-    turned: sparse.csr_matrix = field(init=False)
 
     def __post_init__(self) -> None:
-        self.turned = sparse.csr_matrix(self.rows.T)
         self.diagonal = self._diagonal()
         self.largest = min(1.1 * self._largest_eigenvalue(), _BOUND)
 
@@ -121,13 +168,18 @@ class Level:
         return self.data.shape[0] + 1, self.data.shape[1] + 1
 
     def apply(self, z: FloatArray, a: FloatArray) -> tuple[FloatArray, FloatArray]:
-        out_z = np.zeros_like(z)
-        out_a = np.zeros_like(a)
-        self.data.add(z, a, out_z, out_a)
-        apply_prior(z, *self.height.coefficients(self.cell_m), out_z)
-        apply_prior(a, *self.albedo.coefficients(self.cell_m), out_a)
-        if self.rows.shape[0]:
-            out_z += (self.turned @ (self.row_weight * (self.rows @ z.ravel()))).reshape(z.shape)
+        out_z, out_a = np.empty_like(z), np.empty_like(a)
+        priors = self.height.coefficients(self.cell_m), self.albedo.coefficients(self.cell_m)
+        if isinstance(self.data, FeatureData):
+            over_bands(
+                apply_features, z.shape[0], z.size, self.data.moments, z, a, self.cell_m, *priors,
+                out_z, out_a,
+            )  # fmt: skip
+        else:
+            over_bands(
+                apply_corners, z.shape[0], z.size, self.data.packed, z, a, *priors, out_z, out_a
+            )
+        self.tie.add(z, out_z)
         return out_z, out_a
 
     def _diagonal(self) -> tuple[FloatArray, FloatArray]:
@@ -142,9 +194,9 @@ class Level:
         for d, spectrum in ((d_z, self.height), (d_a, self.albedo)):
             k0, k1, k2 = spectrum.coefficients(self.cell_m)
             d += k0 + 4 * k1 + 20 * k2
-        if self.rows.shape[0]:
-            size = abs(self.rows)
-            reach = self.row_weight * np.asarray(size.sum(axis=1)).ravel()
+        if self.tie.matrix.shape[0]:
+            size = abs(self.tie.matrix)
+            reach = self.tie.weight * np.asarray(size.sum(axis=1)).ravel()
             d_z += (size.T @ reach).reshape(d_z.shape)
         return d_z, d_a
 
@@ -170,53 +222,42 @@ class Level:
         small = np.diag(on) + np.diag(off[1 : len(on)], 1) + np.diag(off[1 : len(on)], -1)
         return float(np.linalg.eigvalsh(small)[-1])
 
-    def smooth(
-        self, z: FloatArray, a: FloatArray, b_z: FloatArray, b_a: FloatArray, degree: int = 3
-    ) -> tuple[FloatArray, FloatArray]:
-        """Damp the upper part of the spectrum of the error by a Chebyshev polynomial."""
+    def smooth(self, z: FloatArray, a: FloatArray, b_z: FloatArray, b_a: FloatArray) -> None:
+        """Damp the upper part of the spectrum of the error of (z, a) by a Chebyshev polynomial, in place."""
         high, low = self.largest, self.largest / 10
         middle, half = (high + low) / 2, (high - low) / 2
         sigma = middle / half
-        rho = 1 / sigma
-        d_z, d_a = self.diagonal
-        y_z, y_a = self.apply(z, a)
-        s_z = (b_z - y_z) / d_z / middle
-        s_a = (b_a - y_a) / d_a / middle
-        for k in range(degree):
-            z = z + s_z
-            a = a + s_a
-            if k == degree - 1:
-                break
+        keep, gain, rho = 0.0, 1 / middle, 1 / sigma
+        s_z, s_a = np.zeros_like(z), np.zeros_like(a)
+        for _ in range(_SMOOTHING):
+            applied = self.apply(z, a)
+            for b, y, d, s, x in zip(
+                (b_z, b_a), applied, self.diagonal, (s_z, s_a), (z, a), strict=True
+            ):
+                over_bands(advance, x.shape[0], x.size, b, y, d, keep, gain, s, x)
             following = 1 / (2 * sigma - rho)
-            y_z, y_a = self.apply(z, a)
-            s_z = following * rho * s_z + 2 * following / half * (b_z - y_z) / d_z
-            s_a = following * rho * s_a + 2 * following / half * (b_a - y_a) / d_a
-            rho = following
-        return z, a
+            keep, gain, rho = following * rho, 2 * following / half, following
 
 
 def prolong(coarse: FloatArray) -> FloatArray:
     """Interpolate nodes of a grid to the grid of half its cell, bilinearly."""
     rows, cols = coarse.shape
     fine = np.empty((2 * rows - 1, 2 * cols - 1))
-    fine[::2, ::2] = coarse
-    fine[1::2, ::2] = 0.5 * (coarse[1:] + coarse[:-1])
-    fine[:, 1::2] = 0.5 * (fine[:, 2::2] + fine[:, :-2:2])
+    over_bands(prolong_rows, fine.shape[0], fine.size, coarse, fine)
     return fine
 
 
 def restrict(fine: FloatArray) -> FloatArray:
     """Apply the transpose of `prolong`."""
-    half = fine[:, ::2].copy()
-    half[:, 1:] += 0.5 * fine[:, 1::2]
-    half[:, :-1] += 0.5 * fine[:, 1::2]
-    coarse = half[::2].copy()
-    coarse[1:] += 0.5 * half[1::2]
-    coarse[:-1] += 0.5 * half[1::2]
+    rows, cols = fine.shape
+    coarse = np.empty((rows // 2 + 1, cols // 2 + 1))
+    over_bands(restrict_rows, coarse.shape[0], fine.size, fine, coarse)
     return coarse
 
 
-def _prolongation_matrix(rows: int, cols: int) -> sparse.csr_matrix:
+def prolongation_matrix(rows: int, cols: int) -> sparse.csr_matrix:
+    """Return `prolong` of a grid (rows, cols) as a matrix."""
+
     def line(n: int) -> sparse.csr_matrix:
         full = 2 * n - 1
         even = np.arange(n)
@@ -234,6 +275,7 @@ class Hierarchy:
     """Levels from fine to coarse, and the V-cycle that preconditions conjugate gradients."""
 
     levels: list[Level]
+    coarsest: CoarseSolver
 
     @classmethod
     def build(
@@ -242,26 +284,82 @@ class Hierarchy:
         moments: FloatArray,
         height: Spectrum,
         albedo: Spectrum,
-        rows: sparse.csr_matrix,
-        row_weight: FloatArray,
+        tie: Tie,
+        coupling: Coupling,
+        gain_block: FloatArray,
     ) -> Hierarchy:
-        data: FeatureData | CornerData = FeatureData(moments, cell_m)
-        levels = [Level(cell_m, data, height, albedo, rows, row_weight)]
-        while all(n % 2 == 0 and n >= 8 for n in data.shape):
-            fine = levels[-1]
-            data = fine.data.coarser()
-            nodes = (data.shape[0] + 1, data.shape[1] + 1)
-            coarse_rows = sparse.csr_matrix(fine.rows @ _prolongation_matrix(*nodes))
-            levels.append(Level(2 * fine.cell_m, data, height, albedo, coarse_rows, row_weight))
-        return cls(levels)
+        """Build all grids down to the one that is factorised.
 
-    def cycle(self, b_z: FloatArray, b_a: FloatArray, at: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Return an approximate solution of the fields' equations for the right-hand side."""
-        level = self.levels[at]
-        zero = np.zeros(level.shape)
+        Parameters
+        ----------
+        moments : the data of the finest grid, (10, rows - 1, cols - 1).
+        tie : equations on heights.
+        coupling : of the finest grid's first coarsening (of the grid itself where it is solved directly).
+        gain_block : normal matrix of the gains alone, data and prior.
+        """
+        data: FeatureData | CornerData = FeatureData(moments, cell_m)
+        levels = [Level(cell_m, data, height, albedo, tie)]
+        while can_halve(levels[-1].shape):
+            fine = levels[-1]
+            data = coarser(fine.data)
+            nodes = (data.shape[0] + 1, data.shape[1] + 1)
+            tied = coupling if len(levels) == 1 else coupling.coarser(prolongation_matrix(*nodes))
+            coupling = tied
+            levels.append(
+                Level(2 * fine.cell_m, data, height, albedo, fine.tie.coarser(nodes), tied)
+            )
+        last = levels[-1]
+        matrix = level_matrix(
+            last.data.local(),
+            last.height.coefficients(last.cell_m),
+            last.albedo.coefficients(last.cell_m),
+            last.tie.matrix,
+            last.tie.weight,
+        )
+        return cls(levels, CoarseSolver.build(matrix, coupling.dense(), gain_block))
+
+    def cycle(
+        self, b_z: FloatArray, b_a: FloatArray, b_g: FloatArray, at: int = 0
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return an approximate solution for the right-hand side: symmetric, and positive.
+
+        Before and after the coarser grids' part the fields are smoothed; gains move on the coarsest grid alone, but
+        what they and the fields do to one another's residual is taken along. On the finest grid that
+        is the coupling of the next one, read through restriction and interpolation.
+        """
         if at == len(self.levels) - 1:
-            return level.smooth(zero, zero.copy(), b_z, b_a, degree=40)
-        z, a = level.smooth(zero, zero.copy(), b_z, b_a)
+            return self.coarsest.solve(b_z, b_a, b_g)
+        level = self.levels[at]
+        z, a = np.zeros(level.shape), np.zeros(level.shape)
+        level.smooth(z, a, b_z, b_a)
         y_z, y_a = level.apply(z, a)
-        c_z, c_a = self.cycle(restrict(b_z - y_z), restrict(b_a - y_a), at + 1)
-        return level.smooth(z + prolong(c_z), a + prolong(c_a), b_z, b_a)
+        felt = b_g - self._gains_of(z, a, at)
+        c_z, c_a, gain = self.cycle(restrict(b_z - y_z), restrict(b_a - y_a), felt, at + 1)
+        z += prolong(c_z)
+        a += prolong(c_a)
+        of_z, of_a = self._fields_of(gain, at)
+        level.smooth(z, a, b_z - of_z, b_a - of_a)
+        return z, a, gain
+
+    def _gains_of(self, z: FloatArray, a: FloatArray, at: int) -> FloatArray:
+        own = self.levels[at].coupling
+        if own is not None:
+            return own.gains_of(z, a)
+        below = self.levels[at + 1].coupling
+        assert below is not None
+        return 0.25 * below.gains_of(restrict(z), restrict(a))
+
+    def _fields_of(self, gain: FloatArray, at: int) -> tuple[FloatArray, FloatArray]:
+        own = self.levels[at].coupling
+        if own is not None:
+            return own.fields_of(gain)
+        below = self.levels[at + 1].coupling
+        assert below is not None
+        z, a = below.fields_of(0.25 * gain)
+        return prolong(z), prolong(a)
+
+
+def can_halve(shape: tuple[int, int]) -> bool:
+    """Return whether a grid is too large to be solved directly and has a coarser one."""
+    rows, cols = shape
+    return rows * cols > COARSEST_NODES and all(n % 2 == 1 and n >= 9 for n in shape)

@@ -14,16 +14,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import sparse
 
-from perception.coarse import CoarseSolver
-from perception.multigrid import Hierarchy, Spectrum
+from perception.bands import over_bands
+from perception.coupling import Coupling
+from perception.level_kernels import prior_rows
+from perception.multigrid import Hierarchy, Spectrum, Tie, can_halve
 from perception.records import FloatArray, IntArray
 from perception.stencils import (
     accumulate_moments,
-    apply_prior,
     dual_features,
     gain_normal,
     gain_to_features,
-    rows_to_gain,
+    rows_and_gain,
     spread_features,
 )
 
@@ -34,7 +35,7 @@ Fields = tuple[FloatArray, FloatArray, FloatArray]
 def add_prior_noise(
     b: FloatArray, weights: tuple[float, float, float], rng: np.random.Generator
 ) -> None:
-    """Add noise whose covariance is the operator of `apply_prior`."""
+    """Add noise whose covariance is the operator of `prior_rows`."""
     rows, cols = b.shape
     k0, k1, k2 = np.sqrt(weights)
     b += k0 * rng.standard_normal((rows, cols))
@@ -85,34 +86,35 @@ class Problem:
     mean_height: FloatArray
     hierarchy: Hierarchy = field(init=False)
     gain_block: FloatArray = field(init=False)
-    coarse: CoarseSolver = field(init=False)
 
     def __post_init__(self) -> None:
         rows, cols = self.shape
-        moments = np.zeros(((rows - 1) * (cols - 1), 10))
+        moments = np.zeros((10, (rows - 1) * (cols - 1)), np.float32)
         accumulate_moments(self.cell, self.weight, self.c_east, self.c_north, self.c_level, moments)
-        self.hierarchy = Hierarchy.build(
-            self.cell_m, moments.reshape(rows - 1, cols - 1, 10), self.height, self.albedo,
-            self.rows, self.row_weight,
-        )  # fmt: skip
         block = self.gain_precision.copy()
         gain_normal(self.knot, self.share, self.weight, block)
         self.gain_block = block
-        data = (self.cell, self.weight, self.c_east, self.c_north, self.c_level)
-        self.coarse = CoarseSolver.build(self.hierarchy, data, self.knot, self.share, block)
-
-    def gain_at(self, gain: FloatArray) -> FloatArray:
-        return np.einsum("ij,ij->i", self.share, gain[self.knot])
+        coupling = Coupling.of_rows(
+            self.shape, self.cell_m, 1 if can_halve(self.shape) else 0,
+            (self.cell, self.weight, self.c_east, self.c_north, self.c_level),
+            self.knot, self.share, len(block),
+        )  # fmt: skip
+        self.hierarchy = Hierarchy.build(
+            self.cell_m, moments.reshape(10, rows - 1, cols - 1), self.height, self.albedo,
+            Tie.of(self.rows, self.row_weight), coupling, block,
+        )  # fmt: skip
 
     def apply(self, z: FloatArray, a: FloatArray, gain: FloatArray) -> Fields:
         out_z, out_a = self.hierarchy.levels[0].apply(z, a)
-        features = self._features(z, a)
         out_g = self.gain_block @ gain
-        rows_to_gain(
-            self.cell, self.weight, self.c_east, self.c_north, self.c_level, self.knot,
-            self.share, features, out_g,
-        )  # fmt: skip
-        self._spread(self.weight * self.gain_at(gain), out_z, out_a)
+        if len(self.cell):
+            rows, cols = self.shape
+            q = np.zeros((4, (rows - 1) * (cols - 1)))
+            rows_and_gain(
+                self.cell, self.weight, self.c_east, self.c_north, self.c_level, self.knot,
+                self.share, self._features(z, a), gain, q, out_g,
+            )  # fmt: skip
+            spread_features(q.reshape(4, rows - 1, cols - 1), self.cell_m, out_z, out_a)
         return out_z, out_a, out_g
 
     def _features(self, z: FloatArray, a: FloatArray) -> FloatArray:
@@ -131,7 +133,12 @@ class Problem:
         b_z = np.zeros(self.shape)
         b_a = np.zeros(self.shape)
         self._spread(self.weight * self.value, b_z, b_a)
-        apply_prior(self.mean_height, *self.height.coefficients(self.cell_m), b_z)
+        of_mean = np.empty(self.shape)
+        over_bands(
+            prior_rows, self.shape[0], b_z.size, np.asarray(self.mean_height, float),
+            self.height.coefficients(self.cell_m), of_mean,
+        )  # fmt: skip
+        b_z += of_mean
         if self.rows.shape[0]:
             b_z += (self.rows.T @ (self.row_weight * self.row_value)).reshape(self.shape)
         v = self.weight * self.value
@@ -162,35 +169,22 @@ class Problem:
         b_g = b_g + np.linalg.cholesky(self.gain_precision) @ rng.standard_normal(n)
         return b_z, b_a, b_g
 
-    def precondition(self, r: Fields) -> Fields:
-        """Return an approximate solution: the coarse one with gains, and a V-cycle for what it leaves.
-
-        ``C + (I - C A) V (I - A C)`` with C the coarse solution and V the V-cycle of the fields alone is
-        symmetric and positive whatever the two are worth.
-        """
-        x = self.coarse.correct(*r)
-        left = _along(r, -1.0, self.apply(*x))
-        z, a = self.hierarchy.cycle(left[0], left[1])
-        step: Fields = (z, a, np.zeros_like(r[2]))
-        back = self.coarse.correct(*self.apply(*step))
-        return _along(_along(x, 1.0, step), -1.0, back)
-
     def solve(
         self,
         start: Fields,
         right: Fields,
-        tolerance: float = 0.5,
+        tolerance: float = 0.2,
         most: int = 100,
     ) -> tuple[Fields, int]:
-        """Solve by conjugate gradients, preconditioned by `precondition`.
+        """Solve by conjugate gradients, preconditioned by a multigrid cycle.
 
         Stops where the error, as the preconditioner measures it, is `tolerance` posterior sigmas in all:
         no combination of heights is then further from the solution than that, however the data scale.
         """
         x: Fields = start
-        y = self.apply(*x)
+        y = self.apply(*(np.ascontiguousarray(part) for part in x))
         r: Fields = _along(right, -1.0, y)
-        s = self.precondition(r)
+        s = self.hierarchy.cycle(*r)
         p = s
         rs = _dot(r, s)
         if rs <= tolerance**2:
@@ -200,7 +194,7 @@ class Problem:
             alpha = rs / _dot(p, y)
             x = _along(x, alpha, p)
             r = _along(r, -alpha, y)
-            s = self.precondition(r)
+            s = self.hierarchy.cycle(*r)
             following = _dot(r, s)
             if following <= tolerance**2:
                 return x, k + 1

@@ -51,72 +51,23 @@ def spread_features(q, cell, out_z, out_a):
             _to_corners(i, j, e, n, m, b, out_z, out_a)
 
 
-@njit(cache=True, fastmath=True)
-def apply_data(moments, z, a, cell, out_z, out_a):
-    """Add the data's normal matrix applied to (z, a)."""
-    rows, cols = z.shape
-    for i in range(rows - 1):
-        for j in range(cols - 1):
-            if moments[i, j, 9] == 0.0:
-                continue
-            sw, se, nw, ne = z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]
-            f0 = (se + ne - sw - nw) / (2 * cell)
-            f1 = (nw + ne - sw - se) / (2 * cell)
-            f2 = 0.25 * (sw + se + nw + ne)
-            f3 = 0.25 * (a[i, j] + a[i, j + 1] + a[i + 1, j] + a[i + 1, j + 1])
-            m = moments[i, j]
-            e = (m[0] * f0 + m[1] * f1 + m[2] * f2 + m[3] * f3) / (2 * cell)
-            n = (m[1] * f0 + m[4] * f1 + m[5] * f2 + m[6] * f3) / (2 * cell)
-            c = 0.25 * (m[2] * f0 + m[5] * f1 + m[7] * f2 + m[8] * f3)
-            b = 0.25 * (m[3] * f0 + m[6] * f1 + m[8] * f2 + m[9] * f3)
-            _to_corners(i, j, e, n, c, b, out_z, out_a)
-
-
-@njit(cache=True, fastmath=True)
-def apply_prior(z, k0, k1, k2, out):
-    """Add (k0 + k1 D'D + k2 L'L) z: D first differences, L the five-point Laplacian."""
-    rows, cols = z.shape
-    for i in range(rows):
-        for j in range(cols):
-            out[i, j] += k0 * z[i, j]
-            if j + 1 < cols:
-                e = k1 * (z[i, j + 1] - z[i, j])
-                out[i, j + 1] += e
-                out[i, j] -= e
-            if i + 1 < rows:
-                e = k1 * (z[i + 1, j] - z[i, j])
-                out[i + 1, j] += e
-                out[i, j] -= e
-    # Second differences along each axis and the twist: together the thin plate, free at its edges.
-    for i in range(rows):
-        for j in range(cols):
-            if 0 < j < cols - 1:
-                e = k2 * (z[i, j + 1] - 2 * z[i, j] + z[i, j - 1])
-                out[i, j + 1] += e
-                out[i, j] -= 2 * e
-                out[i, j - 1] += e
-            if 0 < i < rows - 1:
-                e = k2 * (z[i + 1, j] - 2 * z[i, j] + z[i - 1, j])
-                out[i + 1, j] += e
-                out[i, j] -= 2 * e
-                out[i - 1, j] += e
-            if j + 1 < cols and i + 1 < rows:
-                e = 2 * k2 * (z[i + 1, j + 1] - z[i + 1, j] - z[i, j + 1] + z[i, j])
-                out[i + 1, j + 1] += e
-                out[i + 1, j] -= e
-                out[i, j + 1] -= e
-                out[i, j] += e
-
-
-@njit(cache=True, fastmath=True)
-def rows_to_gain(cell, weight, c_east, c_north, c_level, knot, share, features, out):
-    """Add to `out` (knots) what the data rows say of the fields' `features` (4, duals)."""
+@njit(cache=True, fastmath=True, nogil=True)
+def rows_and_gain(cell, weight, c_east, c_north, c_level, knot, share, features, gain, q, out):
+    """Add what the data rows make of `gain` to the cells' `q` (4, duals), and of `features` to `out` (knots)."""
     for i in range(len(cell)):
-        q = cell[i]
-        v = weight[i] * (c_east[i] * features[0, q] + c_north[i] * features[1, q]
-                         + c_level[i] * features[2, q] + features[3, q])  # fmt: skip
+        j = cell[i]
+        w = weight[i]
+        e, n, c = c_east[i], c_north[i], c_level[i]
+        v = w * (e * features[0, j] + n * features[1, j] + c * features[2, j] + features[3, j])
+        g = 0.0
         for k in range(knot.shape[1]):
             out[knot[i, k]] += v * share[i, k]
+            g += gain[knot[i, k]] * share[i, k]
+        g *= w
+        q[0, j] += g * e
+        q[1, j] += g * n
+        q[2, j] += g * c
+        q[3, j] += g
 
 
 @njit(cache=True, fastmath=True)
@@ -133,21 +84,21 @@ def gain_to_features(cell, value, c_east, c_north, c_level, out):
 
 @njit(cache=True, fastmath=True)
 def accumulate_moments(cell, weight, c_east, c_north, c_level, out):
-    """Add the rows to the cells' 4x4 matrices (duals, 10)."""
+    """Add the rows to the cells' 4x4 matrices (10, duals)."""
     for i in range(len(cell)):
         q = cell[i]
         w = weight[i]
         e, n, c = c_east[i], c_north[i], c_level[i]
-        out[q, 0] += w * e * e
-        out[q, 1] += w * e * n
-        out[q, 2] += w * e * c
-        out[q, 3] += w * e
-        out[q, 4] += w * n * n
-        out[q, 5] += w * n * c
-        out[q, 6] += w * n
-        out[q, 7] += w * c * c
-        out[q, 8] += w * c
-        out[q, 9] += w
+        out[0, q] += w * e * e
+        out[1, q] += w * e * n
+        out[2, q] += w * e * c
+        out[3, q] += w * e
+        out[4, q] += w * n * n
+        out[5, q] += w * n * c
+        out[6, q] += w * n
+        out[7, q] += w * c * c
+        out[8, q] += w * c
+        out[9, q] += w
 
 
 @njit(cache=True, fastmath=True)
@@ -159,98 +110,51 @@ def gain_normal(knot, share, weight, out):
                 out[knot[i, k], knot[i, q]] += weight[i] * share[i, k] * share[i, q]
 
 
-@njit(cache=True)
-def couple_gain(cell, weight, c_east, c_north, c_level, knot, share, cols, cell_m, depth, out):
-    """Add to `out` (2, rows, cols, knots) what ties nodes of a grid 2^depth wider to the gains."""
-    step = 1 << depth
-    for i in range(len(cell)):
-        r = cell[i] // cols
-        c = cell[i] % cols
-        y = ((r % step) + 0.5) / step
-        x = ((c % step) + 0.5) / step
-        for k in range(4):
-            up = k // 2
-            right = k % 2
-            fy = y if up else 1 - y
-            fx = x if right else 1 - x
-            z = (c_east[i] * (fy if right else -fy) + c_north[i] * (fx if up else -fx)) / (
-                step * cell_m
-            ) + c_level[i] * fx * fy
-            for m in range(knot.shape[1]):
-                v = weight[i] * share[i, m]
-                out[0, r // step + up, c // step + right, knot[i, m]] += v * z
-                out[1, r // step + up, c // step + right, knot[i, m]] += v * fx * fy
-
-
-@njit(cache=True, fastmath=True)
-def apply_local(local, z, a, out_z, out_a):
-    """Add the cells' own matrices on their corners' (z, a), packed (36, r, c), applied to the fields."""
-    rows, cols = z.shape
-    u = np.empty(8)
-    v = np.empty(8)
-    for i in range(rows - 1):
-        for j in range(cols - 1):
-            u[0], u[1], u[2], u[3] = z[i, j], z[i, j + 1], z[i + 1, j], z[i + 1, j + 1]
-            u[4], u[5], u[6], u[7] = a[i, j], a[i, j + 1], a[i + 1, j], a[i + 1, j + 1]
-            v[:] = 0.0
-            k = 0
-            for p in range(8):
-                v[p] += local[i, j, k] * u[p]
-                k += 1
-                for q in range(p + 1, 8):
-                    m = local[i, j, k]
-                    v[p] += m * u[q]
-                    v[q] += m * u[p]
-                    k += 1
-            out_z[i, j] += v[0]
-            out_z[i, j + 1] += v[1]
-            out_z[i + 1, j] += v[2]
-            out_z[i + 1, j + 1] += v[3]
-            out_a[i, j] += v[4]
-            out_a[i, j + 1] += v[5]
-            out_a[i + 1, j] += v[6]
-            out_a[i + 1, j + 1] += v[7]
-
-
-@njit(cache=True)
-def local_of_moments(moments, cell):
-    """Return the cells' matrices on their corners (r, c, 36) from those on features (r, c, 10)."""
-    rows, cols = moments.shape[0], moments.shape[1]
+@njit(cache=True, nogil=True)
+def local_of_moments(first, last, moments, cell, out):
+    """Add rows of the cells' matrices on their corners (36, r, c) from those on features (10, r, c)."""
     feature = np.zeros((4, 8))
     for k in range(4):
         feature[0, k] = (1.0 if k % 2 else -1.0) / (2 * cell)
         feature[1, k] = (1.0 if k // 2 else -1.0) / (2 * cell)
         feature[2, k] = 0.25
         feature[3, 4 + k] = 0.25
-    out = np.zeros((rows, cols, 36))
     full = np.empty((4, 4))
-    for i in range(rows):
-        for j in range(cols):
-            if moments[i, j, 9] == 0.0:
+    for i in range(first, last):
+        for j in range(moments.shape[2]):
+            if moments[9, i, j] == 0.0:
                 continue
             k = 0
             for p in range(4):
                 for q in range(p, 4):
-                    full[p, q] = full[q, p] = moments[i, j, k]
+                    full[p, q] = full[q, p] = moments[k, i, j]
                     k += 1
-            pack(feature.T @ full @ feature, out[i, j])
-    return out
+            add_congruent(feature, full, out, i, j)
 
 
-@njit(cache=True)
-def pack(matrix, out):
-    """Add the upper triangle of an 8 x 8 matrix to `out` (36,)."""
+@njit(cache=True, nogil=True)
+def add_congruent(change, full, out, i, j):
+    """Add the upper triangle of ``change' full change`` to `out` (36, r, c) at (i, j)."""
+    m = full.shape[0]
+    half = np.zeros((m, 8))
+    for p in range(m):
+        for s in range(m):
+            v = full[p, s]
+            for q in range(8):
+                half[p, q] += v * change[s, q]
     k = 0
     for p in range(8):
         for q in range(p, 8):
-            out[k] += matrix[p, q]
+            total = 0.0
+            for s in range(m):
+                total += change[s, p] * half[s, q]
+            out[k, i, j] += total
             k += 1
 
 
-@njit(cache=True)
-def coarsen_local(fine):
-    """Return the matrices of cells twice as wide (r / 2, c / 2, 36): exact for bilinear fields."""
-    rows, cols = fine.shape[0] // 2, fine.shape[1] // 2
+@njit(cache=True, nogil=True)
+def coarsen_local(first, last, fine, out):
+    """Add rows of the matrices of cells twice as wide (36, r / 2, c / 2): exact for bilinear fields."""
     # Corner values of each child by those of its parent.
     line = np.array([[[1.0, 0.0], [0.5, 0.5]], [[0.5, 0.5], [0.0, 1.0]]])
     child = np.zeros((4, 8, 8))
@@ -261,15 +165,14 @@ def coarsen_local(fine):
                     v = line[di, p // 2, q // 2] * line[dj, p % 2, q % 2]
                     child[2 * di + dj, p, q] = v
                     child[2 * di + dj, 4 + p, 4 + q] = v
-    out = np.zeros((rows, cols, 36))
     full = np.empty((8, 8))
-    for i in range(2 * rows):
-        for j in range(2 * cols):
+    for i in range(2 * first, 2 * last):
+        for j in range(2 * out.shape[2]):
+            if fine[35, i, j] == 0.0:
+                continue
             k = 0
             for p in range(8):
                 for q in range(p, 8):
-                    full[p, q] = full[q, p] = fine[i, j, k]
+                    full[p, q] = full[q, p] = fine[k, i, j]
                     k += 1
-            c = child[2 * (i % 2) + j % 2]
-            pack(c.T @ full @ c, out[i // 2, j // 2])
-    return out
+            add_congruent(child[2 * (i % 2) + j % 2], full, out, i // 2, j // 2)

@@ -13,7 +13,11 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "inversion": ("inversion", "joint inversion beside interpolated soundings: error, sigma, time"),
     "inversion-terrains": (
         "inversion_terrains",
-        "joint inversion over ten terrains kept apart: error, sigma; a large map's time and memory",
+        "joint inversion over ten terrains kept apart: error, sigma",
+    ),
+    "inversion-large": (
+        "inversion_large",
+        "joint inversion of a thousand cells a side, level and rough: time, memory, error",
     ),
     "experiments": ("experiments", "the experiment runner: overhead, memory, sameness"),
     "sonar-files": ("sonar_files", "reading sonar files: pings a second, memory at 1x and 10x"),

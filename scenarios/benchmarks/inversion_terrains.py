@@ -1,4 +1,4 @@
-"""The joint inversion over ten terrains it was not developed on, and on a map of a thousand cells a side.
+"""The joint inversion over ten terrains it was not developed on.
 
 Pooled over the terrains, errors are held against the claimed sigma; each terrain also has its own rows. The
 seeds are kept apart from those looked at while developing (below 100).
@@ -6,14 +6,12 @@ seeds are kept apart from those looked at while developing (below 100).
 
 from __future__ import annotations
 
-import resource
-import time
 from typing import Any
 
 import numpy as np
 
-from perception.inversion import Look, invert
-from perception.records import FloatArray, Progress, Swath, silent
+from perception.inversion import invert
+from perception.records import FloatArray, Progress, silent
 from scenarios.benchmarks import Row, Table
 from scenarios.benchmarks.inversion import errors, looks_of
 from scenarios.simulation import Simulation
@@ -59,11 +57,11 @@ TERRAINS: dict[str, list[dict[str, Any]]] = {
 
 
 def run(progress: Progress) -> Table:
-    """Invert three parallel passes over each terrain, then a large map."""
+    """Invert three parallel passes over each terrain."""
     rows: list[Row] = []
     off, claimed, alone = [], [], []
     for done, name in enumerate(TERRAINS):
-        progress("terrains", done, len(TERRAINS) + 1)
+        progress("terrains", done, len(TERRAINS))
         simulation = _simulated(TERRAINS[name], [_LINES], 340.0, _SEED + done)
         looks = looks_of(simulation)
         grid = invert(looks, 1.0).grid
@@ -73,9 +71,7 @@ def run(progress: Progress) -> Table:
         claimed.append(sigma)
         alone.append(soundings)
     rows += _rows("all ten", *(np.concatenate(part) for part in (off, claimed, alone)))
-    progress("terrains", len(TERRAINS), len(TERRAINS) + 1)
-    rows += _large()
-    progress("terrains", len(TERRAINS) + 1, len(TERRAINS) + 1)
+    progress("terrains", len(TERRAINS), len(TERRAINS))
     return Table("inversion-terrains", tuple(rows), {"terrains": TERRAINS, "seed": _SEED})
 
 
@@ -89,45 +85,6 @@ def _rows(case: str, error: FloatArray, sigma: FloatArray, soundings: FloatArray
         Row(case, "joint", "within 1 sigma", 100 * float(np.mean(unit < 1)), "%", "60-76"),
         Row(case, "joint", "within 2 sigma", 100 * float(np.mean(unit < 2)), "%", "90-98"),
     ]  # fmt: skip
-
-
-def _large() -> list[Row]:
-    """Return seconds and memory of a map of about 1,000 x 1,000 cells."""
-    looks = [_flat_look(line, np.random.default_rng(_SEED + 50 + line)) for line in range(16)]
-    start = time.perf_counter()
-    grid = invert(looks, 1.0).grid
-    seconds = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
-    cells = f"{grid.shape[0]} x {grid.shape[1]} cells, 16 lines"
-    return [
-        Row("large", "joint", "time", seconds, "s", "<= 60", cells),
-        Row("large", "process", "peak memory", peak, "GB", "<= 2", "echoes included"),
-    ]
-
-
-def _flat_look(line: int, rng: np.random.Generator) -> Look:
-    """Return one of sixteen lines over a level floor: Lambert's law and four looks of speckle.
-
-    What is timed does not depend on the relief, and simulating sixteen kilometres would take minutes.
-    """
-    n, samples, reach_m, altitude_m = 2000, 1024, 75.0, 15.0
-    slant = (np.arange(samples) + 0.5) * reach_m / samples
-    tangent = altitude_m / np.sqrt(np.maximum(slant**2 - altitude_m**2, 1.0))
-    power = np.where(slant > altitude_m, tangent**2 / np.sqrt(1 + tangent**2), 1e-4)
-    port, starboard = (
-        np.sqrt(power * rng.standard_gamma(4.0, (n, samples), np.float32) / 4).astype(np.float32)
-        for _ in range(2)
-    )
-    still, nan = np.zeros(n), np.full(n, np.nan)
-    swath = Swath(
-        time_s=np.arange(n) * 0.3, ping=np.arange(n), easting_m=np.full(n, 0.3 + 54.0 * line),
-        northing_m=np.arange(n) * 0.47, depth_m=np.full(n, 45.0), heading_rad=still,
-        pitch_rad=still, roll_rad=still, altitude_hint_m=nan,
-        sample_m=np.full(n, reach_m / samples), port=port, starboard=starboard,
-        sound_speed_m_s=np.full(n, 1500.0), crs="EPSG:32633", pass_index=line,
-    )  # fmt: skip
-    first = altitude_m + 0.1 * np.sin(np.arange(n) * 0.05 + line) + 0.02 * rng.standard_normal(n)
-    return Look(swath, first, np.full(n, 0.03))
 
 
 def _simulated(
