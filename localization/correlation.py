@@ -24,7 +24,12 @@ _COARSE_SIDE = 300
 _VERIFY_POINTS = 4000
 # Log likelihood ratio between best and second place: e^12 covers a million places tried.
 _DISTINCT = 12.0
-_LEAST_NCC = 0.5
+# The best of all wrong places reaches 20 to 30: e^18 places and turns on a thousand cells a side, each
+# fitted. As sure again as above, and some for ground that repeats itself.
+_CHANCE = 45.0
+# Places are ranked without what a Gaussian of this part of the patch keeps (of 3, 6, 12 the last ranked
+# best, docs/terrain-navigation.md); octaves of fewer values are left out.
+_LONGEST_PART, _FEWEST_VALUES = 12.0, 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +44,7 @@ class Match:
     covariance : (3, 3) of row, col (cells) and turn (rad).
     misfit_m : rms of what is left after removing the mean.
     independent : number of independent values in what is left.
+    evidence : log likelihood ratio of the place against ground of no relation to the patch.
     """
 
     row: float
@@ -48,6 +54,7 @@ class Match:
     covariance: FloatArray
     misfit_m: float
     independent: float = 0.0
+    evidence: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +83,7 @@ def masked_ncc(values: FloatArray, patch: FloatArray, least_overlap: float) -> F
     -------
     (R + r - 1, C + c - 1) : element (i, j) has the patch's first cell at (i - r + 1, j - c + 1).
     """
-    return _ncc_with(_Spectra(values, patch.shape), patch, least_overlap)
+    return _ncc_with(_Spectra(values, patch.shape), patch, least_overlap)[0]
 
 
 class _Spectra:
@@ -93,7 +100,10 @@ class _Spectra:
         self.square = fft.rfft2(f * f, self.size)
 
 
-def _ncc_with(spectra: _Spectra, patch: FloatArray, least_overlap: float) -> FloatArray:
+def _ncc_with(
+    spectra: _Spectra, patch: FloatArray, least_overlap: float
+) -> tuple[FloatArray, FloatArray]:
+    """Correlation at every place, and the number of common cells."""
     known = np.isfinite(patch)
     g = np.where(known, patch - np.nanmean(patch), 0.0)[::-1, ::-1]
     mask = fft.rfft2(known[::-1, ::-1].astype(float), spectra.size)
@@ -114,7 +124,7 @@ def _ncc_with(spectra: _Spectra, patch: FloatArray, least_overlap: float) -> Flo
     usable = (number >= least_overlap) & (var_f > least) & (var_g > least)
     ncc = np.full(spectra.full, -1.0)
     ncc[usable] = cross[usable] / np.sqrt(var_f[usable] * var_g[usable])
-    return np.clip(ncc, -1.0, 1.0)
+    return np.clip(ncc, -1.0, 1.0), number
 
 
 def match_patch(
@@ -145,12 +155,17 @@ def match_patch(
         if turn_rad is None
         else np.array([turn_rad])
     )
-    candidates = _candidates(coarse_map, coarse_patch, turns, thin, 3 * keep, values.shape)
+    candidates = _candidates(coarse_map, coarse_patch, turns, thin, values.shape)
     free = turn_rad is None
-    verified = [verify(values, patch, c, free) for c in candidates]
-    verified.sort(key=lambda m: -m.ncc)
-    chosen = _distinct(verified, max(patch.shape) / 10)[:keep]
-    return _judge(chosen)
+    found, verified = Matching((), False, "", 0.0), list[Match]()
+    # Weak ground may hide the true place far down the coarse list: look there only if need be.
+    for first, last in ((0, 3 * keep), (3 * keep, 15 * keep)):
+        verified += [verify(values, patch, c, free) for c in candidates[first:last]]
+        verified.sort(key=lambda m: -m.evidence)
+        found = _judge(_distinct(verified, max(patch.shape) / 10)[:keep])
+        if found.accepted:
+            break
+    return found
 
 
 def _thinned(values: FloatArray, every: int) -> FloatArray:
@@ -186,32 +201,52 @@ def _candidates(
     patch: FloatArray,
     turns: FloatArray,
     thin: int,
-    number: int,
     shape: tuple[int, ...],
 ) -> list[Match]:
-    """Return the highest peaks over all turns, in cells of the full map."""
+    """Return the places that fit best over all turns, in cells of the full map.
+
+    Long waves are taken off both first: of smooth ground they are most of the relief and tell places
+    apart least. A place is ranked by evidence, common cells times
+    ``-log(1 - ncc^2)``: the same correlation over half of the patch says half as much.
+    """
     side = int(np.ceil(np.hypot(*patch.shape))) if len(turns) > 1 else max(patch.shape)
-    spectra = _Spectra(values, (side, side))
+    width = min(patch.shape) / _LONGEST_PART
+    sharp, fine = _sharpened(patch, width), _sharpened(values, width)
+    spectra = _Spectra(fine, (side, side))
     least = _LEAST_OVERLAP * float(np.isfinite(patch).sum())
-    found: list[Match] = []
+    found: list[tuple[float, Match]] = []
     for turn in turns:
-        turned = rotated(patch, float(turn))
-        ncc = _ncc_with(spectra, turned, least)
+        turned = rotated(sharp, float(turn))
+        ncc, common = _ncc_with(spectra, turned, least)
+        told = -common * np.log1p(-(np.clip(ncc, 0.0, 0.999) ** 2))
         for _ in range(4):
-            i, j = np.unravel_index(int(np.argmax(ncc)), ncc.shape)
-            score = float(ncc[i, j])
-            if score <= 0:
+            i, j = np.unravel_index(int(np.argmax(told)), told.shape)
+            if told[i, j] <= 0:
                 break
             row = i - turned.shape[0] + 1 + (turned.shape[0] - 1) / 2
             col = j - turned.shape[1] + 1 + (turned.shape[1] - 1) / 2
             at = ((row + 0.5) * thin - 0.5, (col + 0.5) * thin - 0.5)
-            found.append(Match(*at, float(turn), score, np.full((3, 3), np.nan), np.nan))
+            match = Match(*at, float(turn), float(ncc[i, j]), np.full((3, 3), np.nan), np.nan)
+            found.append((float(told[i, j]), match))
             near = max(2, min(patch.shape) // 6)
-            ncc[max(i - near, 0) : i + near + 1, max(j - near, 0) : j + near + 1] = -1.0
-    found.sort(key=lambda m: -m.ncc)
+            told[max(i - near, 0) : i + near + 1, max(j - near, 0) : j + near + 1] = 0.0
     if not found:
         return [Match(0.0, 0.0, float(turns[0]), -1.0, np.full((3, 3), np.nan), np.nan)]
-    return _distinct(found, max(shape) / 200)[:number]
+    found.sort(key=lambda f: -f[0])
+    return _distinct([match for _, match in found], max(shape) / 200)
+
+
+def _sharpened(values: FloatArray, width: float) -> FloatArray:
+    """Take off what a Gaussian of `width` cells keeps, holes left out."""
+    return values - smoothed(values, width)
+
+
+def smoothed(values: FloatArray, width: float | FloatArray) -> FloatArray:
+    """Smooth by a Gaussian of `width` cells (both axes, or one for each); NaN is left out and stays."""
+    known = np.isfinite(values)
+    weight = ndimage.gaussian_filter(known.astype(float), width, mode="constant")
+    total = ndimage.gaussian_filter(np.where(known, values, 0.0), width, mode="constant")
+    return np.where(known, total / np.maximum(weight, 1e-12), np.nan)
 
 
 def _distinct(matches: list[Match], apart: float) -> list[Match]:
@@ -232,8 +267,9 @@ def verify(values: FloatArray, patch: FloatArray, start: Match, free_turn: bool)
     fit = _Fit(values, patch, start.turn_rad, free_turn)
     x = np.array([start.row, start.col, start.turn_rad])[: 3 if free_turn else 2]
     # A gentle blur widens the basin that least squares converges in; the map itself has the answer.
-    for blur in (1.0, 0.0):
+    for blur in (1.0, 0.0, 0.0):
         fit.blur(blur)
+        fit.settle(x)
         solved = optimize.least_squares(
             fit.residual, x, x_scale=fit.scale[: len(x)], diff_step=1e-4, max_nfev=20
         )
@@ -257,7 +293,41 @@ def verify(values: FloatArray, patch: FloatArray, start: Match, free_turn: bool)
         covariance=_covariance(solved, len(miss), independent, free_turn),
         misfit_m=float(miss.std()),
         independent=independent,
+        evidence=_evidence(patch, _misfit(values, patch, full)),
     )
+
+
+def _misfit(values: FloatArray, patch: FloatArray, full: FloatArray) -> FloatArray:
+    """The patch less the map under it at a place, in the patch's cells; NaN where either has none."""
+    r, q = np.indices(patch.shape)
+    r, q = r - (patch.shape[0] - 1) / 2, q - (patch.shape[1] - 1) / 2
+    c, s = np.cos(full[2]), np.sin(full[2])
+    at = np.array([full[0] + c * r + s * q, full[1] - s * r + c * q])
+    return patch - ndimage.map_coordinates(values, at, order=1, cval=np.nan)
+
+
+def _evidence(patch: FloatArray, miss: FloatArray) -> float:
+    """Log likelihood ratio of a place against ground of no relation to the patch.
+
+    Octave by octave: the variance that the place leaves over the patch's own, by the number of independent
+    values that the octave has on the common cells. One number for all octaves would be misled twice: a
+    white noise hides that what is left of the long waves looks like terrain, and a smooth stretch of map
+    "fits" short waves better than a rough one. An octave that the place does not explain counts nothing.
+    """
+    common = np.isfinite(miss)
+    cells = float(common.sum())
+    own, left = np.where(common, patch, np.nan), miss
+    own, left = own - np.nanmean(own), left - np.nanmean(left)
+    width, total, values = 0.0, 0.0, cells
+    while values > _FEWEST_VALUES:
+        next_width = max(2.0 * width, 1.0)
+        smooth_own, smooth_left = smoothed(own, next_width), smoothed(left, next_width)
+        # A field smoothed by s has a correlation area of 2 pi s^2.
+        fewer = cells / (2 * np.pi * next_width**2)
+        before, after = float(np.nanvar(own - smooth_own)), float(np.nanvar(left - smooth_left))
+        total += 0.5 * (values - fewer) * max(float(np.log(before / max(after, 1e-30))), 0.0)
+        own, left, width, values = smooth_own, smooth_left, next_width, fewer
+    return total
 
 
 class _Fit:
@@ -277,6 +347,7 @@ class _Fit:
         self.known = known.astype(np.float32)
         self.turn, self.free = turn, free
         self.scale = np.array([1.0, 1.0, 2.0 / max(patch.shape)])
+        self.inside = np.ones(len(self.heights), bool)
         self.blur(0.0)
 
     def blur(self, cells: float) -> None:
@@ -294,13 +365,21 @@ class _Fit:
         inside = ndimage.map_coordinates(self.known, at, order=1, cval=0.0) > 0.99
         return ndimage.map_coordinates(self.map, at, order=1, mode="nearest"), inside
 
+    def settle(self, x: FloatArray) -> None:
+        """Choose the points that count: those with data under them at a place.
+
+        They stay the same while the place moves a little. Points that come and go at a border would be
+        steps of the misfit, and their derivatives a certainty that is not there.
+        """
+        _, self.inside = self.read(self.full(x))
+
     def residual(self, x: FloatArray) -> FloatArray:
         """Misfit without its mean; zero where the map has no data."""
-        there, inside = self.read(self.full(x))
+        there, _ = self.read(self.full(x))
         miss = self.heights - there
-        if inside.sum() < _LEAST_OVERLAP * len(miss):
+        if self.inside.sum() < _LEAST_OVERLAP * len(miss):
             return np.full(len(miss), 10.0 * float(self.heights.std()) + 1.0)
-        return np.where(inside, miss - miss[inside].mean(), 0.0)
+        return np.where(self.inside, miss - miss[self.inside].mean(), 0.0)
 
 
 def _covariance(
@@ -318,25 +397,17 @@ def _covariance(
 
 
 def _judge(matches: list[Match]) -> Matching:
-    """Accept the best if no other place fits nearly as well.
-
-    Were the second the true place, what it leaves would be noise, and the best could leave less only
-    by chance: the log likelihood ratio says how unlikely that is. The number of independent points is
-    the best misfit's own, so a misfit that looks like terrain proves nothing.
-    """
+    """Accept the best if chance does not explain it and no other place fits nearly as well."""
     best = matches[0]
-    if best.ncc < _LEAST_NCC or not np.isfinite(best.covariance).all():
-        reason = f"no place fits: best correlation {best.ncc:.2f}"
-        return Matching(tuple(matches), False, reason, 0.0)
-    if len(matches) == 1:
-        return Matching(tuple(matches), True, "one place fits", np.inf)
-    left = [max(1.0 - m.ncc**2, 1e-9) for m in matches[:2]]
-    margin = 0.5 * best.independent * float(np.log(left[1] / left[0]))
-    where = f"correlation {best.ncc:.2f} here, {matches[1].ncc:.2f} elsewhere"
-    if margin < _DISTINCT:
-        reason = f"ambiguous: {where} (log likelihood ratio {margin:.1f}, {_DISTINCT:g} needed)"
-        return Matching(tuple(matches), False, reason, margin)
-    return Matching(tuple(matches), True, f"{where}: log likelihood ratio {margin:.0f}", margin)
+    margin = best.evidence - (matches[1].evidence if len(matches) > 1 else 0.0)
+    where = f"log likelihood ratio {best.evidence:.0f} against unrelated ground"
+    if not np.isfinite(best.covariance).all() or best.evidence < _CHANCE:
+        reason = f"no place fits: {where}, {_CHANCE:g} needed"
+    elif margin < _DISTINCT:
+        reason = f"ambiguous: {where}, {margin:.1f} above the next place, {_DISTINCT:g} needed"
+    else:
+        return Matching(tuple(matches), True, f"{where}, {margin:.0f} above the next place", margin)
+    return Matching(tuple(matches), False, reason, margin)
 
 
 def _independent(field: FloatArray) -> float:

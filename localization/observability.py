@@ -7,7 +7,8 @@ information on (east, north, depth bias), with J = (g_east, g_north, 1); the bia
 Cramer-Rao bound of the horizontal error, ``sqrt(trace(inverse))``; start information of the vehicle's
 own position is added, so featureless ground gives the start's sigma rather than infinity.
 
-Soundings that share a map error count together, as in `localization.likelihood`.
+Soundings that share a map error count together, as in `localization.likelihood`. A linear bound cannot see
+rival places: what they add is found by simulating lines over the map (`localization.ambiguity`).
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from localization.ambiguity import Line, corrected, risen, square_miss
 from localization.likelihood import DEFAULT_LENGTH_M
 from localization.measurements import Sensors, beam_vectors, default_beams
+from localization.readings import Reading
 from localization.terrain import TerrainMap
 from perception.records import FloatArray, Grid, Progress, silent
 
@@ -33,22 +36,25 @@ class ObservabilityConfig:
     spacing_m : way from one update to the next.
     altitude_m : height above the bottom.
     headings : number of headings tried, over half a turn (a line has the same information both ways).
+    lines : number of lines simulated to learn what the bound does not see; 0 gives the bound itself.
     """
 
     path_m: float = 300.0
     spacing_m: float = 4.5
     altitude_m: float = 50.0
     headings: int = 8
+    lines: int = 64
 
 
 @dataclass(frozen=True, slots=True)
 class Observability:
-    """Bounds on the horizontal error of a fix, (rows, cols) m, NaN no data.
+    """Horizontal error of a fix, 1-sigma of both axes together, (rows, cols) m, NaN no data.
 
     Attributes
     ----------
     best_m, worst_m, mean_m : over the headings; `best_heading_rad` is the first's.
     by_heading_m : (headings, rows, cols).
+    over_bound : median of the error over the linear bound.
     """
 
     best_m: FloatArray
@@ -57,19 +63,22 @@ class Observability:
     best_heading_rad: FloatArray
     by_heading_m: FloatArray
     headings_rad: FloatArray
+    over_bound: float
 
 
 def observability(
     terrain: TerrainMap,
-    sensors: Sensors | None = None,
+    sensors: Sensors | None,
+    rng: np.random.Generator,
     config: ObservabilityConfig | None = None,
     progress: Progress = silent,
 ) -> Observability:
-    """Compute the Cramer-Rao bound of a terrain fix for every cell and heading.
+    """Compute the error of a terrain fix for every cell and heading.
 
     Parameters
     ----------
     sensors : beams, noise and start sigma; four beams at 30 degrees by default.
+    rng : source of the lines simulated.
     """
     sensors, config = sensors or Sensors(), config or ObservabilityConfig()
     headings = np.arange(config.headings) * np.pi / config.headings
@@ -77,7 +86,9 @@ def observability(
     for i, heading in enumerate(headings):
         layers.append(bound_at(terrain, sensors, config, float(heading)))
         progress("observability", i + 1, len(headings))
-    bounds = np.array(layers)
+    linear = np.array(layers)
+    knots = simulated(terrain, sensors, config, linear, rng, progress)
+    bounds = linear if knots is None else corrected(linear, knots)
     known = np.isfinite(terrain.height_m)
     filled = np.where(known, bounds, np.inf)
     best = np.argmin(filled, axis=0)
@@ -88,7 +99,84 @@ def observability(
         best_heading_rad=np.where(known, headings[best], np.nan),
         by_heading_m=bounds,
         headings_rad=headings,
+        over_bound=float(np.nanmedian(bounds / linear)),
     )
+
+
+def simulated(
+    terrain: TerrainMap,
+    sensors: Sensors,
+    config: ObservabilityConfig,
+    bounds_m: FloatArray,
+    rng: np.random.Generator,
+    progress: Progress = silent,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Simulate lines over the map; return how the error rises with the bound, see `ambiguity.risen`.
+
+    Parameters
+    ----------
+    bounds_m : (headings, rows, cols) from `bound_at`.
+
+    Returns
+    -------
+    None where hardly a line fits on the map: it is smaller than the path, or full of holes.
+    """
+    cells = np.argwhere(np.isfinite(bounds_m))
+    bound, square = [], []
+    for i in range(config.lines):
+        progress("lines simulated", i + 1, config.lines)
+        # Where most of the map is too near its edge, a few tries a line must do.
+        for _ in range(5):
+            heading, row, col = rng.choice(cells)
+            reading = terrain.readings[rng.integers(len(terrain.readings))]
+            line = _line_over(terrain, reading, sensors, config, (heading, row, col))
+            if np.isfinite(terrain.heights(line.east_m, line.north_m)).all():
+                bound.append(float(bounds_m[heading, row, col]))
+                square.append(
+                    square_miss(
+                        reading.height_m, terrain.height_m, terrain.frame, line, bound[-1], rng
+                    )
+                )
+                break
+    if len(bound) < config.lines / 4 or not bound:
+        return None
+    return risen(np.array(bound), np.array(square))
+
+
+def _line_over(
+    terrain: TerrainMap,
+    reading: Reading,
+    sensors: Sensors,
+    config: ObservabilityConfig,
+    cell: tuple[int, int, int],
+) -> Line:
+    """The soundings of a line through a cell (heading, row, column), the map's error as one reading has it."""
+    heading = cell[0] * np.pi / config.headings
+    slant, vectors, noise_m = _beams(sensors, config)
+    number = max(round(config.path_m / config.spacing_m), 1) + 1
+    along = (np.arange(number) - (number - 1) / 2) * config.spacing_m
+    reach = np.array([_offset(r * v, heading) for r, v in zip(slant, vectors, strict=True)])
+    east = terrain.west_m + cell[2] * terrain.cell_m + np.sin(heading) * along
+    north = terrain.north_m - cell[1] * terrain.cell_north_m + np.cos(heading) * along
+    east, north = (east + reach[:, :1]).ravel(), (north + reach[:, 1:]).ravel()
+    range_m2 = np.repeat(noise_m**2, number)
+    apart = np.hypot(east[:, None] - east, north[:, None] - north)
+    covariance = reading.shared_m**2 * np.exp(-apart / reading.length_m)
+    covariance += np.diag(range_m2 + terrain.error.between_m**2 + 1e-9)
+    shared = _shared_variance(terrain, config, slant * np.hypot(vectors[:, 0], vectors[:, 1]))
+    return Line(east, north, covariance, range_m2 + shared, sensors.start_m, sensors.depth_bias_m)
+
+
+def _beams(
+    sensors: Sensors, config: ObservabilityConfig
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Slant ranges (n,), unit vectors (n, 3) in the body frame, and noise of the height (n,)."""
+    beams = sensors.beams or default_beams(4)
+    vectors = beam_vectors(beams)
+    slant = config.altitude_m / vectors[:, 2]
+    fractions = np.array([b.fraction or sensors.beam_fraction for b in beams])
+    noise = np.maximum(fractions * slant, sensors.beam_floor_m) * vectors[:, 2]
+    return slant, vectors, noise
 
 
 def bound_at(
@@ -96,11 +184,7 @@ def bound_at(
 ) -> FloatArray:
     """Bound (rows, cols) for lines of one heading; see the module's head."""
     slope_e, slope_n, known = _slopes(terrain)
-    beams = sensors.beams or default_beams(4)
-    vectors = beam_vectors(beams)
-    slant = config.altitude_m / vectors[:, 2]
-    fractions = np.array([b.fraction or sensors.beam_fraction for b in beams])
-    noise = np.maximum(fractions * slant, sensors.beam_floor_m) * vectors[:, 2]
+    slant, vectors, noise = _beams(sensors, config)
     per_line = max(config.path_m / config.spacing_m, 1.0)
     sums = np.zeros((6, *terrain.height_m.shape))
     products = (
@@ -109,7 +193,7 @@ def bound_at(
     kernel = _line(terrain, config.path_m, heading_rad)
     lines = [_along(np.where(known, p, 0.0), kernel) for p in products]
     shared = _shared_variance(terrain, config, slant * np.hypot(vectors[:, 0], vectors[:, 1]))
-    for b in range(len(beams)):
+    for b in range(len(slant)):
         weight = per_line / (noise[b] ** 2 + shared)
         east, north = _offset(slant[b] * vectors[b], heading_rad)
         shift = (-north / terrain.cell_north_m, east / terrain.cell_m)

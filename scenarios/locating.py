@@ -197,27 +197,20 @@ def _config(options: LocateOptions, sensors: Sensors) -> dict[str, Any]:
 
 
 def observe(
-    prior: Path,
-    out: Path,
-    sensors: Path | None,
-    map_sigma_m: float | None,
-    map_error_length_m: float | None,
-    altitude_m: float,
-    path_m: float,
-    progress: Progress,
+    options: LocateOptions, out: Path, altitude_m: float, path_m: float, progress: Progress
 ) -> dict[str, Any]:
-    """Run `locate --observability`: the bound on a fix's error for every cell, as map and picture."""
+    """Run `locate --observability`: a fix's error for every cell, as map and picture."""
     from localization.observability import ObservabilityConfig, as_grid, observability
     from mapping.rasters import write_bands
     from scenarios.outputs import write_metrics
     from scenarios.plots_navigation import draw_observability
 
     began = time.perf_counter()
-    grid, source = prior_with_sigma(prior, map_sigma_m)
-    terrain = terrain_map(grid, map_error_length_m)
-    chosen = Sensors() if sensors is None else read_sensors(sensors)
+    grid, source = prior_with_sigma(options.prior, options.map_sigma_m)
+    terrain = terrain_map(grid, options.map_error_length_m)
+    chosen = Sensors() if options.sensors is None else read_sensors(options.sensors)
     config = ObservabilityConfig(path_m=path_m, altitude_m=altitude_m)
-    found = observability(terrain, chosen, config, progress)
+    found = observability(terrain, chosen, np.random.default_rng(options.seed), config, progress)
     bands = {
         "sigma_best": found.best_m, "sigma_mean": found.mean_m, "sigma_worst": found.worst_m,
         "best_heading_deg": np.degrees(found.best_heading_rad),
@@ -233,9 +226,10 @@ def observe(
         "sigma_mean_median_m": float(np.nanmedian(found.mean_m)),
         "sigma_worst_median_m": float(np.nanmedian(found.worst_m)),
         "share_below_10_m": float(np.nanmean(found.mean_m[np.isfinite(found.mean_m)] < 10.0)),
+        "over_bound_median": found.over_bound,
         "map_sigma_source": source,
         "seconds": round(time.perf_counter() - began, 3),
     }
-    settings = {"map": prior, "sensors_resolved": asdict(chosen), **asdict(config)}
-    write_metrics(out, metrics, settings)
+    settings = {"map": options.prior, "sensors_resolved": asdict(chosen), **asdict(config)}
+    write_metrics(out, metrics, settings, options.seed)
     return metrics

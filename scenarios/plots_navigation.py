@@ -14,6 +14,7 @@ from matplotlib.colors import LogNorm
 
 from localization.navfile import NavTable
 from localization.observability import Observability
+from localization.placing import Placing
 from perception.files import whole_file
 from perception.records import Grid, Trajectory
 
@@ -148,6 +149,55 @@ def draw_observability(path: Path, prior: Grid, found: Observability) -> None:
         panel.ticklabel_format(useOffset=False, style="plain")
         panel.tick_params(axis="x", labelrotation=30)
     axes[0].set_ylabel("northing (m)")
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+    plt.close(figure)
+
+
+def draw_placing(path: Path, prior: Grid, patch: Grid, placing: Placing) -> None:
+    """Draw `patch.png`: the map with every place kept outlined, and the patch beside it."""
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(12, 6), constrained_layout=True, width_ratios=(1.6, 1)
+    )
+    every = max(1, max(prior.shape) // 1200)
+    image = left.imshow(
+        prior.elevation_m[::every, ::every],
+        extent=(prior.west_m, prior.east_m, prior.south_m, prior.north_m),
+        cmap="viridis", interpolation="nearest",
+    )  # fmt: skip
+    figure.colorbar(image, ax=left, label="elevation (m)", shrink=0.75)
+    half_e = 0.5 * (patch.east_m - patch.west_m)
+    half_n = 0.5 * (patch.north_m - patch.south_m)
+    corners = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1], [-1, -1]]) * (half_e, half_n)
+    for rank, place in reversed(list(enumerate(placing.places))):
+        c, s = np.cos(place.turn_rad), np.sin(place.turn_rad)
+        east = place.easting_m + c * corners[:, 0] + s * corners[:, 1]
+        north = place.northing_m + c * corners[:, 1] - s * corners[:, 0]
+        best = rank == 0
+        colour = ("#c81e1e" if placing.accepted else "#e08a00") if best else "white"
+        words = f"{'placed' if placing.accepted else 'likeliest, no fix'}" if best else "rival"
+        left.plot(
+            east, north, color=colour, lw=2 if best else 1, ls="-" if best else "--",
+            label=words if best or rank == 1 else None,
+        )  # fmt: skip
+        # Where the patch's own north lies.
+        left.plot(
+            [place.easting_m, place.easting_m + s * half_n],
+            [place.northing_m, place.northing_m + c * half_n], color=colour, lw=1,
+        )  # fmt: skip
+    left.set_xlabel("easting (m)")
+    left.set_ylabel("northing (m)")
+    left.ticklabel_format(useOffset=False, style="plain")
+    left.tick_params(axis="x", labelrotation=30)
+    if placing.places:
+        figure.legend(loc="outside lower left", ncols=2, fontsize=8)
+    right.imshow(
+        patch.elevation_m, extent=(-half_e, half_e, -half_n, half_n), cmap="viridis",
+        interpolation="nearest",
+    )  # fmt: skip
+    right.set_title("the patch")
+    right.set_xlabel("its own east (m)")
+    right.set_ylabel("its own north (m)")
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=110)
     plt.close(figure)

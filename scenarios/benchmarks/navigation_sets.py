@@ -237,7 +237,19 @@ def make_set(
     if floor is None:
         floor = spectral_floor(config, floor_rng)
     prior = prior_map(floor, config, map_rng)
-    easting, northing = lawnmower(config, track_rng)
+    track = lawnmower(config, track_rng)
+    return NavigationSet(prior, sounded(config, floor, track, track_rng, beam_rng), *track)
+
+
+def sounded(
+    config: SetConfig,
+    floor: Floor,
+    track_m: tuple[FloatArray, FloatArray],
+    track_rng: np.random.Generator,
+    beam_rng: np.random.Generator,
+) -> dict[str, FloatArray]:
+    """Columns of nav.csv for a true track, easting and northing (n,) each."""
+    easting, northing = track_m
     n = len(easting)
     time_s = np.arange(n) * config.interval_s
     step_e, step_n = np.diff(easting), np.diff(northing)
@@ -256,7 +268,7 @@ def make_set(
         wild = beam_rng.random(n) < config.outliers
         name = "altitude_m" if config.sensors == "altimeter" else f"beam{b + 1}_m"
         nav[name] = np.where(wild, beam_rng.uniform(5.0, 150.0, n), beam)
-    return NavigationSet(prior, nav, easting, northing)
+    return nav
 
 
 def _navigation(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -30,6 +31,9 @@ from scenarios.commands.console import (
 @click.option("--observability", is_flag=True, help="Map where terrain can fix a vehicle, and how well; needs --map only.")  # fmt: skip
 @click.option("--altitude", type=click.FloatRange(min=0, min_open=True), default=50.0, show_default=True, help="Altitude for --observability, m.")  # fmt: skip
 @click.option("--path", "path_m", type=click.FloatRange(min=1), default=300.0, show_default=True, help="Length of track for --observability, m.")  # fmt: skip
+@click.option("--patch", type=click.Path(path_type=Path), help="Raster of sea floor to place anywhere in the map, in its own axes.")  # fmt: skip
+@click.option("--heading", type=click.FloatRange(-360.0, 360.0), help="Azimuth of the patch's own north, degrees, where it is known; else every heading is tried.")  # fmt: skip
+@click.option("--compact", is_flag=True, help="Place --patch by the map's hills and hollows alone, a hundredth of its bytes.")  # fmt: skip
 @click.option("--follow", is_flag=True, help="Read rows (CSV or JSON lines) from standard input, write estimates as they come.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.")
 @common_options
@@ -45,6 +49,9 @@ def command(
     observability: bool,
     altitude: float,
     path_m: float,
+    patch: Path | None,
+    heading: float | None,
+    compact: bool,
     follow: bool,
     out: Path | None,
     quiet: bool,
@@ -58,10 +65,11 @@ def command(
       bathynav locate --map chart.bag --map-sigma 0.3 --nav nav.csv --sensors dvl.toml --out runs/locate
       bathynav locate --map prior.tif --nav nav.csv --swath survey.xtf --out runs/locate
       bathynav locate --observability --map prior.tif --out runs/where
+      bathynav locate --patch strip.tif --map prior.tif --out runs/patch
       tail -f nav.csv | bathynav locate --follow --map prior.tif
     """
     set_verbosity(quiet, verbose)
-    _check_usage(nav, swath, observability, follow, out)
+    _check_usage(nav, swath, observability, patch, heading, compact, follow, out)
     from scenarios.locating import LocateOptions, locate, observe
 
     options = LocateOptions(
@@ -75,25 +83,97 @@ def command(
     assert out is not None
     prepare_out(out)
     with progress_bars(quiet) as progress:
-        if observability:
-            metrics = observe(
-                prior, out, sensors, map_sigma, map_error_length, altitude, path_m, progress
-            )
+        if patch is not None:
+            from scenarios.locating_patch import place_patch
+
+            metrics = place_patch(prior, patch, heading, compact, out)
+        elif observability:
+            metrics = observe(options, out, altitude, path_m, progress)
         else:
             metrics = locate(options, out, progress)
     if not quiet:
-        rows = [(k, f"{v:.4g}" if isinstance(v, float) else str(v)) for k, v in metrics.items()]
-        print_table(f"{out}", rows)
+        print_table(f"{out}", in_words(metrics))
+
+
+def _told(key: str, value: object) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    # A coordinate has more figures than an error.
+    return f"{value:.2f}" if key in ("easting_m", "northing_m") else f"{value:.4g}"
+
+
+# Names of figures as people say them.
+_WORDS = {
+    "verdict": "verdict",
+    "converged_after_s": "converged after (s)",
+    "share_converged": "part of the rows converged",
+    "share_searching": "part searching",
+    "share_dead_reckoning": "part on dead reckoning",
+    "share_lost": "part lost",
+    "sigma_last_m": "1-sigma at the end, both axes together (m)",
+    "sigma_median_m": "1-sigma, median (m)",
+    "protection_last_m": "protection level at the end (m)",
+    "heading_bias_deg": "heading error found (deg)",
+    "scale_error": "scale error found",
+    "depth_bias_m": "depth error found (m)",
+    "fixes_accepted": "outside fixes used",
+    "fixes_refused": "outside fixes refused",
+    "map_sigma_m": "1-sigma of the map as stated (m)",
+    "map_sigma_filtered_m": "1-sigma of the map as used (m)",
+    "map_relief_m": "relief of the map (m)",
+    "map_sigma_source": "sigma of the map from",
+    "rows": "rows of navigation",
+    "beams": "beams",
+    "events": "events",
+    "easting_m": "easting (m)",
+    "northing_m": "northing (m)",
+    "heading_deg": "heading of the patch's north (deg)",
+    "sigma_easting_m": "1-sigma of the easting (m)",
+    "sigma_northing_m": "1-sigma of the northing (m)",
+    "sigma_heading_deg": "1-sigma of the heading (deg)",
+    "protection_m": "protection level (m)",
+    "offset_easting_m": "east of where its file has it (m)",
+    "offset_northing_m": "north of where its file has it (m)",
+    "ambiguity": "probability of the other places",
+    "hypotheses": "places kept",
+    "map_carried_percent": "map used, % of the raster's bytes",
+    "sigma_best_median_m": "1-sigma on the best heading, median (m)",
+    "sigma_mean_median_m": "1-sigma over all headings, median (m)",
+    "sigma_worst_median_m": "1-sigma on the worst heading, median (m)",
+    "over_bound_median": "the same over the linear bound, median",
+    "share_below_10_m": "part of the map known to 10 m",
+    "seconds": "time taken (s)",
+}
+
+
+def in_words(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """Figures worth printing, named in words; the others are in metrics.json."""
+    return [
+        (words, _told(key, metrics[key]))
+        for key, words in _WORDS.items()
+        if metrics.get(key) is not None and metrics[key] != ""
+    ]
 
 
 def _check_usage(
-    nav: Path | None, swath: tuple[Path, ...], observability: bool, follow: bool, out: Path | None
+    nav: Path | None,
+    swath: tuple[Path, ...],
+    observability: bool,
+    patch: Path | None,
+    heading: float | None,
+    compact: bool,
+    follow: bool,
+    out: Path | None,
 ) -> None:
-    if observability and follow:
-        raise click.UsageError("--observability and --follow exclude one another")
-    if (nav or swath) and (observability or follow):
-        raise click.UsageError("--nav and --swath go without --observability and --follow")
-    if not (nav or swath or observability or follow):
-        raise click.UsageError("give --nav NAV.csv, --swath SURVEY, --observability or --follow")
+    if sum((observability, follow, patch is not None)) > 1:
+        raise click.UsageError("--observability, --patch and --follow exclude one another")
+    if (nav or swath) and (observability or follow or patch):
+        raise click.UsageError("--nav and --swath go without --observability, --patch and --follow")
+    if not (nav or swath or observability or follow or patch):
+        raise click.UsageError(
+            "give --nav NAV.csv, --swath SURVEY, --patch PATCH.tif, --observability or --follow"
+        )
+    if (compact or heading is not None) and patch is None:
+        raise click.UsageError("--heading and --compact go with --patch PATCH.tif")
     if out is None and not follow:
         raise click.UsageError("give --out DIR")

@@ -9,11 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner, Result
+from scipy import ndimage
 
 from mapping.rasters import write_map
 from perception.records import Grid, InputError, NoOverlapError
 from scenarios.benchmarks.navigation_sets import NavigationSet, SetConfig, make_set
-from scenarios.commands.locate import command
+from scenarios.commands.locate import command, in_words
 
 CONFIG = SetConfig(extent_m=2000.0, duration_s=420.0)
 
@@ -121,8 +122,55 @@ def test_observability_is_a_map_and_a_picture(tmp_path: Path) -> None:
     assert 0.05 < metrics["sigma_best_median_m"] <= metrics["sigma_worst_median_m"] < 71.0
 
 
+@pytest.mark.parametrize("compact", [False, True])
+def test_a_patch_is_placed_with_its_heading_and_drawn(
+    files: Path, drawn: NavigationSet, tmp_path: Path, compact: bool
+) -> None:
+    """A turned square read from the map itself comes back; its rivals are in a table."""
+    prior = drawn.prior
+    turn, side = np.radians(110.0), 120
+    centre = np.array([prior.west_m + 900.0, prior.north_m - 1100.0])
+    at = (np.arange(side) - (side - 1) / 2) * prior.cell_m
+    x, y = np.meshgrid(at, at[::-1])
+    row, col = prior.fractional_index(
+        centre[0] + np.cos(turn) * x + np.sin(turn) * y,
+        centre[1] + np.cos(turn) * y - np.sin(turn) * x,
+    )
+    height = ndimage.map_coordinates(prior.elevation_m, [row, col], order=1)
+    write_map(tmp_path / "patch.tif", Grid(height, 0.0, side * prior.cell_m, prior.cell_m))
+    arguments = ["--map", files / "prior.tif", "--patch", tmp_path / "patch.tif"]
+    result = locate(*arguments, *["--compact"] * compact, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "heading of the patch's north (deg)" in result.output
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["fix"] is True, metrics["verdict"]
+    assert np.hypot(metrics["easting_m"] - centre[0], metrics["northing_m"] - centre[1]) < 10.0
+    # Zone 31's grid north and true north differ by the convergence, up to 3 degrees so far west.
+    assert abs(metrics["heading_deg"] - 110.0) < 4.0
+    table = pd.read_csv(tmp_path / "out" / "hypotheses.csv")
+    assert table.accepted.sum() == 1
+    assert (tmp_path / "out" / "patch.png").stat().st_size > 0
+    assert metrics["map_carried_percent"] == pytest.approx(100.0) or compact
+
+
+def test_figures_are_printed_in_words_and_one_sigma_at_a_time() -> None:
+    told = in_words(
+        {"sigma_last_m": 1.234567, "converged": True, "easting_m": 512345.678, "events": ""}
+    )
+    assert told == [
+        ("1-sigma at the end, both axes together (m)", "1.235"), ("easting (m)", "512345.68"),
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "arguments", [(), ("--observability", "--follow"), ("--observability", "--nav", "x.csv")]
+    "arguments",
+    [
+        (),
+        ("--observability", "--follow"),
+        ("--observability", "--nav", "x.csv"),
+        ("--patch", "p.tif", "--follow"),
+        ("--nav", "x.csv", "--compact"),
+    ],
 )
 def test_wrong_usage_is_exit_two(files: Path, arguments: tuple[str, ...]) -> None:
     result = locate("--map", files / "prior.tif", *arguments)

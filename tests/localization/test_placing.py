@@ -1,0 +1,129 @@
+"""A patch placed anywhere in a map: where, which way round, how sure, and when not at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import navsets
+import numpy as np
+import pytest
+
+from localization.placing import Placing, in_cells, place_on_landmarks, place_on_raster
+from perception.records import Grid, InputError
+
+CENTRE_M = (612.5, 587.0)
+TURN = 2.2
+
+
+def prior(error_m: float = 0.1) -> Grid:
+    return navsets.prior(np.random.default_rng(1), error_m=error_m)
+
+
+def patch(
+    side_m: float = 305.0,
+    cell_m: float = 5.0,
+    noise_m: float = 0.4,
+    seed: int = 2,
+    centre_m: tuple[float, float] = CENTRE_M,
+) -> Grid:
+    """Heights of a turned square in its own axes, from the analytic floor, three metres too high."""
+    n = round(side_m / cell_m)
+    at = (np.arange(n) - (n - 1) / 2) * cell_m
+    x, y = np.meshgrid(at, at[::-1])
+    east = centre_m[0] + np.cos(TURN) * x + np.sin(TURN) * y
+    north = centre_m[1] + np.cos(TURN) * y - np.sin(TURN) * x
+    noise = noise_m * np.random.default_rng(seed).standard_normal((n, n))
+    return Grid(navsets.floor_m(east, north) + 3.0 + noise, 0.0, 0.0, cell_m)
+
+
+def assert_placed(placing: Placing, near_m: float) -> None:
+    best = placing.places[0]
+    assert placing.accepted, placing.reason
+    assert np.hypot(best.easting_m - CENTRE_M[0], best.northing_m - CENTRE_M[1]) < near_m
+    assert abs(best.turn_rad - TURN) < np.radians(1.0)
+
+
+@pytest.mark.parametrize("cell_m", [5.0, 2.0])
+def test_a_patch_of_any_cell_is_placed_with_its_heading(cell_m: float) -> None:
+    placing = place_on_raster(prior(), patch(cell_m=cell_m))
+    assert_placed(placing, 2.0)
+    assert placing.ambiguity < 1e-6
+
+
+def test_errors_are_as_large_as_claimed() -> None:
+    squares = []
+    for seed in range(8):
+        placing = place_on_raster(prior(0.3), patch(seed=seed, noise_m=1.0), TURN)
+        best = placing.places[0]
+        apart = np.array([best.easting_m - CENTRE_M[0], best.northing_m - CENTRE_M[1]])
+        squares.append(apart @ np.linalg.solve(best.covariance[:2, :2], apart))
+        assert np.hypot(*apart) < best.protection_m
+    # Chi-square of 16 degrees of freedom lies within 4 and 39 but for one time in a thousand.
+    assert 4.0 < sum(squares) < 39.0
+
+
+def test_a_patch_partly_off_the_map_is_placed_on_what_is_left_of_it() -> None:
+    whole = prior()
+    first = 105
+    cut = replace(
+        whole,
+        elevation_m=whole.elevation_m[:, first:],
+        west_m=whole.west_m + first * whole.cell_m,
+        sigma_m=None,
+    )
+    assert_placed(place_on_raster(cut, patch()), 3.0)
+
+
+def test_ground_that_the_map_lacks_is_no_fix() -> None:
+    rng = np.random.default_rng(3)
+    other = rng.standard_normal((61, 61)).cumsum(axis=0).cumsum(axis=1) / 20
+    placing = place_on_raster(prior(), Grid(other, 0.0, 0.0, 5.0), TURN)
+    assert not placing.accepted
+    assert "no place fits" in placing.reason
+
+
+def test_flat_ground_is_no_fix() -> None:
+    flat = Grid(0.2 * np.random.default_rng(4).standard_normal((60, 60)), 0.0, 0.0, 5.0)
+    assert not place_on_raster(prior(), flat, TURN).accepted
+
+
+def test_a_map_that_repeats_itself_is_ambiguous() -> None:
+    once = prior().elevation_m[:150, :100]
+    twice = Grid(np.concatenate([once, once], axis=1), 0.0, 1000.0, 5.0)
+    part = Grid(once[40:100, 20:80].copy(), 0.0, 0.0, 5.0)
+    placing = place_on_raster(twice, part, 0.0)
+    assert not placing.accepted
+    assert "ambiguous" in placing.reason
+    assert placing.ambiguity > 0.01
+
+
+def test_hills_and_hollows_alone_do_not_place_what_is_not_there() -> None:
+    rng = np.random.default_rng(5)
+    other = rng.standard_normal((100, 100)).cumsum(axis=0).cumsum(axis=1) / 20
+    placing = place_on_landmarks(prior(), Grid(other, 0.0, 0.0, 5.0))
+    assert not placing.accepted
+    assert placing.carried_bytes < 0.02 * 4 * prior().elevation_m.size
+
+
+@pytest.mark.parametrize(
+    ("grid", "words"),
+    [
+        (Grid(np.zeros((8, 8)), 0.0, 0.0, 5.0), "holds 64 heights"),
+        (Grid(np.zeros((2000, 20)), 0.0, 0.0, 5.0), "are they swapped"),
+    ],
+)
+def test_a_patch_that_cannot_be_placed_is_refused_with_the_value(grid: Grid, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        place_on_raster(prior(), grid)
+
+
+@pytest.mark.parametrize("cell_m", [2.5, 12.0])
+def test_resampling_keeps_a_plane_where_it_is(cell_m: float) -> None:
+    east, north = np.meshgrid((np.arange(60) + 0.5) * 4.0, 240.0 - (np.arange(60) + 0.5) * 4.0)
+    grid = Grid(0.1 * east - 0.3 * north, 0.0, 240.0, 4.0)
+    out = in_cells(grid, cell_m)
+    e, n = np.meshgrid(*out.centres())
+    inner = (slice(4, -4), slice(4, -4))
+    np.testing.assert_allclose(
+        out.elevation_m[inner], (0.1 * e - 0.3 * n)[inner], atol=0.02 * cell_m
+    )
