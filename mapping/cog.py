@@ -14,6 +14,7 @@ import psutil
 import rasterio
 import rasterio.shutil
 from rasterio._err import CPLE_BaseError
+from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 from rasterio.windows import Window
@@ -23,6 +24,8 @@ from perception.records import Grid, InputError, Progress, silent
 
 # What GDAL may keep of rasters in memory, MB; its own default is a twentieth of the machine's.
 _CACHE_MB = 256
+# Cells on a side of a block of the file.
+_BLOCK = 512
 
 Slices = tuple[slice, slice]
 # A disk that fills up is told by GDAL's own exception where rasterio does not turn it into one of its own.
@@ -51,6 +54,15 @@ class Frame:
     def transform(self) -> Affine:
         north = self.cell_m if self.cell_north_m is None else self.cell_north_m
         return Affine(self.cell_m, 0, self.west_m, 0, -north, self.north_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What a raster's values are: GDAL's type, no data, and how overviews are made of them."""
+
+    dtype: str = "float32"
+    nodata: float = float("nan")
+    overviews: str = "average"
 
 
 class Statistics:
@@ -93,16 +105,18 @@ def write_cog(
     windows: Iterable[tuple[Slices, Mapping[str, npt.NDArray[Any]]]],
     tags: Mapping[str, str] | None = None,
     progress: Progress = silent,
+    kind: Kind | None = None,
 ) -> None:
-    """Write described float32 bands, NaN nodata, with averaged overviews and statistics.
+    """Write described bands with overviews and statistics.
 
-    A plain tiled GeoTIFF beside it takes the windows in any order; GDAL then orders tiles and overviews as
+    A plain tiled GeoTIFF beside it takes the windows in any order and its overviews; GDAL then orders both as
     a COG wants them, block by block. Memory stays at a window and GDAL's cache, whatever the size.
 
     Parameters
     ----------
     windows : slices of the raster (rows from the north) with the values of every band; what no window covers is
-        NaN.
+        no data.
+    kind : of the values; None is float32, NaN no data, with averaged overviews.
 
     Raises
     ------
@@ -110,10 +124,11 @@ def write_cog(
         The file cannot be written; nothing is left behind.
     """
     rows, cols = frame.shape
+    kind = kind or Kind()
     profile = {
-        "driver": "GTiff", "dtype": "float32", "count": len(bands), "height": rows, "width": cols,
-        "crs": frame.crs or None, "transform": frame.transform, "nodata": float("nan"),
-        "tiled": True, "blockxsize": 512, "blockysize": 512, "interleave": "band",
+        "driver": "GTiff", "dtype": kind.dtype, "count": len(bands), "height": rows, "width": cols,
+        "crs": frame.crs or None, "transform": frame.transform, "nodata": kind.nodata,
+        "tiled": True, "blockxsize": _BLOCK, "blockysize": _BLOCK, "interleave": "band",
         "sparse_ok": True, "bigtiff": "if_safer",
     }  # fmt: skip
     _remove_drafts_of_the_dead(path)
@@ -121,22 +136,37 @@ def write_cog(
     try:
         with whole_file(path) as temporary, rasterio.Env(GDAL_CACHEMAX=_CACHE_MB):
             with rasterio.open(draft, "w", **profile) as target:
-                said = _fill(target, bands, windows)
+                said = _fill(target, bands, windows, kind)
                 for index, (name, statistics) in enumerate(said.items(), start=1):
                     target.set_band_description(index, name)
                     target.update_tags(index, **statistics.tags(rows * cols))
                 datum = {"VERTICAL_DATUM": frame.datum} if frame.datum else {}
                 target.update_tags(**datum, **dict(tags or {}))
-            progress("writing the raster", 0, 1)
+            progress("writing the raster", 0, 2)
+            levels = _overview_levels(frame.shape)
+            # Left to the COG driver, overviews take four times as long as all the rest.
+            with rasterio.open(draft, "r+") as target:
+                target.build_overviews(levels, Resampling[kind.overviews])
+            progress("writing the raster", 1, 2)
             rasterio.shutil.copy(
                 draft, temporary, driver="COG", compress="deflate", predictor="yes", level="2",
-                overview_resampling="average", bigtiff="if_safer", num_threads="2",
+                overviews="FORCE_USE_EXISTING" if levels else "NONE", blocksize=str(_BLOCK),
+                bigtiff="if_safer", num_threads="2",
             )  # fmt: skip
-            progress("writing the raster", 1, 1)
+            progress("writing the raster", 2, 2)
     except RASTER_ERRORS as error:
         raise InputError(f"{path}: cannot be written ({error}); is the disk full?") from error
     finally:
         draft.unlink(missing_ok=True)
+
+
+def _overview_levels(shape: tuple[int, int]) -> list[int]:
+    """Return the factors of the overviews: halves, until one block holds the whole."""
+    levels, factor = [], 1
+    while max(shape) > _BLOCK * factor:
+        factor *= 2
+        levels.append(factor)
+    return levels
 
 
 def _remove_drafts_of_the_dead(path: Path) -> None:
@@ -151,12 +181,14 @@ def _fill(
     target: Any,
     bands: Sequence[str],
     windows: Iterable[tuple[Slices, Mapping[str, npt.NDArray[Any]]]],
+    kind: Kind,
 ) -> dict[str, Statistics]:
     said = {name: Statistics() for name in bands}
     for (rows, cols), values in windows:
         window = Window(cols.start, rows.start, cols.stop - cols.start, rows.stop - rows.start)
         for index, name in enumerate(bands, start=1):
-            band = np.asarray(values[name], np.float32)
+            band = np.asarray(values[name], kind.dtype)
             target.write(band, index, window=window)
-            said[name].add(band)
+            if kind.dtype == "float32":  # bits have no mean
+                said[name].add(band)
     return said

@@ -7,7 +7,9 @@ at the end may differ by a part of its sigma.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,6 +26,37 @@ from mapping.survey import CorrectedSurvey, SurveyConfig, assemble
 from mapping.survey_check import check, least_square_m, square_cell_m, swath_width
 from mapping.textures import default_cell, thinned
 from perception.records import ElevationStrip, Progress, silent
+
+logger = logging.getLogger(__name__)
+
+
+def pass_by_pass(
+    strips: Sequence[ElevationStrip],
+    fixes: Sequence[PositionFix] = (),
+    config: SurveyConfig | None = None,
+    progress: Progress = silent,
+) -> CorrectedSurvey:
+    """Correct a survey as `correct_survey` does, each pass as it comes, with the fixes nearest to it in time.
+
+    Raises
+    ------
+    InputError
+        No strip, or strips that cannot be one survey.
+    """
+    check(strips)
+    own: list[list[PositionFix]] = [[] for _ in strips]
+    for fix in fixes:
+        away_s = [
+            max(float(s.time_s.min()) - fix.time_s, fix.time_s - float(s.time_s.max()), 0.0)
+            for s in strips
+        ]
+        own[int(np.argmin(away_s))].append(fix)
+    survey = IncrementalSurvey(config, fixes_to_come=any(fix.accepted for fix in fixes))
+    for number, (strip, given) in enumerate(zip(strips, own, strict=True), start=1):
+        so_far = survey.add_pass(strip, given, progress)
+        used = sum(r.used for r in so_far.registrations)
+        logger.info("pass %d: %d of %d registrations", number, used, len(so_far.registrations))
+    return so_far
 
 
 class IncrementalSurvey:
@@ -77,9 +110,12 @@ class IncrementalSurvey:
         registrations = [
             Registration(w, m, bool(next(used)) if m.accepted else False) for w, m in found[0]
         ]
+        # What was taken out again is no part of the survey: wider squares, and what contradicts the rest.
+        kept = np.flatnonzero(solution.link_used)
+        solution = replace(solution, link_used=np.ones(len(kept), bool))
         return assemble(
-            self._strips, keyframes, solution, registrations, self._graph.links, self._squares,
-            self._ties, self._steps, (), config,
+            self._strips, keyframes, solution, registrations, [self._graph.links[i] for i in kept],
+            [self._squares[i] for i in kept], self._ties, self._steps, (), config,
         )  # fmt: skip
 
     def _match(

@@ -201,6 +201,14 @@ def on_window(
     return _pass_raster(sums, offset, strip.height_m, strip.height_sigma_m)
 
 
+def runs_on(
+    blocks: Sequence[tuple[int, int, Window]], window: Window, n: int
+) -> Iterator[tuple[int, int]]:
+    """Yield the runs of a strip's `n` lines whose blocks touch a window, each with the first line past it."""
+    touching = [block for block in blocks if block[2].common(window)]
+    return _runs(touching, n) if touching else iter(())
+
+
 def _hull(windows: Sequence[Window]) -> Window:
     row, col = min(w.row for w in windows), min(w.col for w in windows)
     rows = max(w.row + w.rows for w in windows) - row

@@ -6,11 +6,13 @@ right to half a per cent.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
+from mapping.flag_layer import NO_FLAGS, flag_figures, flagged_cells
 from mapping.quality import ONE_D_95, S44_ORDERS
 from mapping.tiles import Layers
 from perception.records import FloatArray
@@ -37,11 +39,20 @@ def tile_figures(layers: Layers | None) -> dict[str, Any]:
         "sigma": _histogram("sigma", sigma),
         "depth": _histogram("depth", depth),
         "count": _histogram("count", layers["count"][seen]),
+        "flags": _flagged(layers),
         "s44": {
             order: int((vertical <= np.hypot(a, b * depth)).sum())
             for order, (a, b, _, _) in S44_ORDERS.items()
         },
     }
+
+
+def _flagged(layers: Layers) -> dict[str, int]:
+    """Return how many cells bear each flag; nothing of layers without flags."""
+    if "flags" not in layers:
+        return {}
+    known = np.nan_to_num(layers["flags"], nan=NO_FLAGS).astype(np.uint8)
+    return flagged_cells(known)
 
 
 def _histogram(name: str, values: FloatArray) -> dict[str, int]:
@@ -91,5 +102,13 @@ def map_figures(tiles: Iterable[dict[str, Any]], cells: int, cell_m: float) -> d
         "mapped_m2": mapped * cell_m**2,
         "coverage_of_rectangle": mapped / cells,
         "median_data_per_cell": _median("count", [tile["count"] for tile in full]),
+        **flag_figures(_added(tile["flags"] for tile in full), mapped),
         **shares,
     }
+
+
+def _added(counts: Iterable[dict[str, int]]) -> dict[str, int]:
+    total: Counter[str] = Counter()
+    for count in counts:
+        total.update(count)
+    return dict(total)

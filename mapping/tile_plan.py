@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,10 +19,10 @@ from mapping.fusion import map_window
 from mapping.gridding import Window
 from mapping.placed import PlacedStrip, boxes
 from perception.files import existing_file, whole_file
-from perception.records import FloatArray, InputError
+from perception.records import BoolArray, FloatArray, InputError
 
 # Part of every tile's key: raise it when the same strips would give another map.
-_METHOD = 1
+_METHOD = 2
 # A tile of 1,024 cells holds some 40 MB of sums while it is made, and 12 MB in the store.
 TILE_CELLS = 1024
 # Lattices beyond this are a mistake of units rather than a survey.
@@ -50,10 +51,23 @@ class StripFile:
 
     def rows(self, first: int, last: int, names: Sequence[str]) -> tuple[FloatArray, ...]:
         """Return the named variables of lines first to last - 1, NaN where there is no data."""
+        with self._opened() as data:
+            return tuple(np.asarray(data[name][first:last], np.float32) for name in names)
+
+    def flags(self, first: int, last: int) -> tuple[npt.NDArray[np.uint8], BoolArray]:
+        """Return the flags of those lines, none where the file has no such variable, and where a height is."""
+        with self._opened() as data:
+            seen = np.isfinite(data["elevation_m"][first:last])
+            if "flags" not in data.variables:
+                return np.zeros(seen.shape, np.uint8), seen
+            return np.asarray(data["flags"][first:last], np.uint8), seen
+
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
         try:
             with netCDF4.Dataset(self.path) as data:
                 data.set_auto_mask(False)  # NaN is no data, with or without a mask
-                return tuple(np.asarray(data[name][first:last], np.float32) for name in names)
+                yield data
         except (OSError, IndexError) as error:
             raise InputError(
                 f"{self.path}: cannot be read as a strip ({error}); run the same command again to "

@@ -1,6 +1,6 @@
 """The store of a tiled map: a Zarr group of the map's layers, and a mark for every tile that is done.
 
-FOLDER/map.zarr      elevation, sigma, count, echo, one chunk a tile; y and x; CF attributes
+FOLDER/map.zarr      elevation, sigma, count, echo, flags, one chunk a tile; y and x; CF attributes
 FOLDER/plan.npz      the plan, for the workers
 FOLDER/marks/        ROW-COL.json: the tile's key and figures, written after its chunks
 """
@@ -29,6 +29,7 @@ _ATTRIBUTES = {
     "sigma": ("m", "1-sigma of the cell's mean height", ""),
     "count": ("1", "number of data", ""),
     "echo": ("dB", "echo level over nominal", ""),
+    "flags": ("1", "quality flags, bits as in flags.tif", ""),
     "fill": ("m", "height of filled cells, which hold no data", ""),
     "fill_sigma": ("m", "1-sigma of filled cells", ""),
 }
@@ -121,7 +122,9 @@ def clear(folder: Path) -> None:
 
 def _frame(plan: TilePlan) -> list[Any]:
     window = plan.window
-    return [plan.cell_m, plan.crs, window.row, window.col, *plan.shape, plan.tile_cells]
+    lattice = [plan.cell_m, plan.crs, window.row, window.col, *plan.shape, plan.tile_cells]
+    # A store of an older version lacks a layer.
+    return [*lattice, *LAYERS]
 
 
 def _frame_of(path: Path) -> Any:

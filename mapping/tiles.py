@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from mapping.flag_layer import decided, no_votes, vote
 from mapping.fusion import combine
 from mapping.mosaic import echo_sigma, level_db
 from mapping.placed import PassRaster, PlacedStrip, on_window
@@ -20,7 +21,7 @@ from perception.records import FloatArray
 Layers = dict[str, npt.NDArray[np.float32]]
 
 # A tile's layers, in the order of the store: NaN no data; count 0.
-LAYERS = ("elevation", "sigma", "count", "echo")
+LAYERS = ("elevation", "sigma", "count", "echo", "flags")
 _RIM = 1
 
 
@@ -29,15 +30,17 @@ def fuse_tile(plan: TilePlan, tile: tuple[int, int]) -> Layers | None:
 
     Returns
     -------
-    dict of `LAYERS` to (rows, cols) float32, rows north to south; echo in dB.
+    dict of `LAYERS` to (rows, cols) float32, rows north to south; echo in dB, flags of `CellFlag`.
     """
     outer, core = plan.outer(tile, _RIM), plan.core(tile)
     heights: list[PassRaster] = []
     echoes: list[PassRaster] = []
+    votes = no_votes(core)
     for index in plan.touching(tile):
         one, blocks = plan.strips[index], plan.boxes[index]
         height = on_window(one.strip, blocks, plan.cell_m, outer)
         echo = on_window(_echoes(one), blocks, plan.cell_m, core)
+        vote(one.strip, one.file.flags, blocks, plan.cell_m, core, votes)
         if height is not None:
             heights.append(height)
         if echo is not None:
@@ -52,6 +55,7 @@ def fuse_tile(plan: TilePlan, tile: tuple[int, int]) -> Layers | None:
         "sigma": sigma[inner],
         "count": count[inner],
         "echo": level_db(power),
+        "flags": np.where(np.isfinite(mean[inner]), decided(votes), np.nan),
     }
     return {name: np.ascontiguousarray(layers[name][::-1], np.float32) for name in LAYERS}
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,18 @@ import numpy as np
 import numpy.typing as npt
 
 from mapping.cog import Frame, Slices, write_cog
-from mapping.compare import Difference, difference, write_changes
+from mapping.compare import write_changes
 from mapping.fill import fill_map
+from mapping.flag_layer import (
+    FLAGS_KIND,
+    NO_FLAGS,
+    flag_figures,
+    flag_tags,
+    flagged_cells,
+    map_flags,
+    write_flags,
+)
+from mapping.height_tie import HeightTie
 from mapping.mosaic import echo_mosaic, write_mosaic
 from mapping.objects import merge_objects, write_objects
 from mapping.pose_graph_files import write_graph
@@ -40,45 +49,19 @@ from scenarios.survey_map import SurveyMap
 from scenarios.survey_tiles import TiledSurvey
 
 
-@dataclass(frozen=True, slots=True)
-class Tie:
-    """How a map was tied to a prior one: the shift of its heights, the datum, and what is left."""
-
-    shift_m: float
-    datum: str
-    left: Difference
-
-    def metrics(self) -> dict[str, Any]:
-        return {"prior_shift_m": self.shift_m} | {
-            f"prior_{name}": value for name, value in self.left.statistics.items()
-        }
-
-
-def tie_to_prior(grid: Grid, old: Grid) -> Tie:
-    """Find the shift of heights that brings a map onto a prior one, and how the two still differ.
-
-    The shift is the median difference: tide and depth bias are common to a survey, changes of the
-    floor are not.
-    """
-    shift_m = float(np.nanmedian(difference(grid, old).grid.elevation_m))
-    datum = old.datum or grid.datum
-    tied = replace(grid, elevation_m=grid.elevation_m + shift_m, datum=datum)
-    return Tie(shift_m, datum, difference(tied, old))
-
-
 def write_whole(
     out: Path,
     survey: Survey,
     result: SurveyMap,
-    tie: Tie | None = None,
+    tie: HeightTie | None = None,
     fill_m: float | None = None,
 ) -> dict[str, Any]:
     """Write the folder of a map in one piece, gaps filled up to `fill_m` from data; return its metrics."""
-    grid = result.grid
-    if tie is not None:
-        grid = replace(grid, elevation_m=grid.elevation_m + tie.shift_m, datum=tie.datum)
+    grid = result.grid if tie is None else tie.tied(result.grid)
     drawn, filled = (grid, None) if fill_m is None else fill_map(grid, fill_m)
     write_map(out / "map.tif", drawn, filled=filled)
+    flags = map_flags(result.corrected.strips, grid)
+    write_flags(out / "flags.tif", flags, grid)
     mosaic = echo_mosaic(result.corrected.strips, grid.cell_m, survey.crs)
     write_mosaic(out / "mosaic.tif", mosaic)
     _write_pictures(out, drawn, mosaic, result.raw_track, result.track)
@@ -100,6 +83,7 @@ def write_whole(
             else float(np.median(grid.sigma_m[seen])),
         }
         | survey_quality(result.corrected.strips, grid, result.track)
+        | flag_figures(flagged_cells(flags), int(seen.sum()))
     )
 
 
@@ -112,45 +96,70 @@ def write_tiled(
     out: Path,
     survey: Survey,
     result: TiledSurvey,
-    tie: Tie | None = None,
+    tie: HeightTie | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Write the folder of a map in tiles, a window at a time; return its metrics."""
-    shift_m = 0.0 if tie is None else tie.shift_m
-    plan, store = result.plan, result.store
+    plan = result.plan
     datum = plan.datum if tie is None else tie.datum
     frame = Frame(plan.west_m, plan.north_m, plan.cell_m, plan.shape, plan.crs, datum)
 
     tied: list[dict[str, Any]] = []
-
-    def windows(*names: str) -> Iterator[tuple[Slices, dict[str, npt.NDArray[Any]]]]:
-        tiles = plan.tiles()
-        for done, tile in enumerate(tiles, start=1):
-            where = plan.slices(tile)
-            layers = {name: store.read(name, where) for name in names}
-            if "elevation" in layers:
-                layers["elevation"] = layers["elevation"] + np.float32(shift_m)
-                if tie is not None:  # depths are not what they were when the tile was made
-                    tied.append(tile_figures(layers))
-                if result.filled is not None:
-                    fill, fill_sigma = (store.read(name, where) for name in FILL_LAYERS)
-                    layers = with_fill(layers, fill + np.float32(shift_m), fill_sigma)
-            yield where, layers
-            progress("tiles to raster", done, len(tiles))
-
+    # Depths are not what they were when the tiles were made: what depends on them is counted anew.
+    count = None if tie is None else tied.append
     bands = ("elevation", "sigma", "count")
     extra = () if result.filled is None else ("filled",)
-    write_cog(out / "map.tif", frame, (*bands, *extra), windows(*bands))
-    echoes = ((where, {"echo_db": layers["echo"]}) for where, layers in windows("echo"))
+    write_cog(out / "map.tif", frame, (*bands, *extra), _heights(result, tie, count, progress))
+    echoes = ((where, {"echo_db": x["echo"]}) for where, x in _windows(result, ("echo",), progress))
     write_cog(out / "mosaic.tif", frame, ("echo_db",), echoes)
-    grid = result.overview()
-    grid = replace(grid, elevation_m=grid.elevation_m + shift_m)
+    flags = ((where, _bits(x)) for where, x in _windows(result, ("flags",), progress))
+    write_cog(out / "flags.tif", frame, ("flags",), flags, flag_tags(), kind=FLAGS_KIND)
+    grid = result.overview() if tie is None else tie.tied(result.overview())
     _write_pictures(out, grid, result.overview("echo"), result.raw_track, result.track)
     pings = [strip.ping for strip in result.strips]
     shared = _write_shared(out, survey, result, pings, tie)
     figures = map_figures(tied, plan.shape[0] * plan.shape[1], plan.cell_m) if tied else None
     filled = _fill_figures(result.filled, plan.cell_m**2)
     return shared | filled | _tiled_figures(result, figures or result.figures)
+
+
+Windows = Iterator[tuple[Slices, dict[str, npt.NDArray[Any]]]]
+
+
+def _windows(result: TiledSurvey, names: Sequence[str], progress: Progress) -> Windows:
+    """Yield each tile's slices and layers."""
+    tiles = result.plan.tiles()
+    for done, tile in enumerate(tiles, start=1):
+        where = result.plan.slices(tile)
+        yield where, {name: result.store.read(name, where) for name in names}
+        progress("tiles to raster", done, len(tiles))
+
+
+def _heights(
+    result: TiledSurvey,
+    tie: HeightTie | None,
+    count: Callable[[dict[str, Any]], None] | None,
+    progress: Progress,
+) -> Windows:
+    """Yield each tile's heights, tied to the prior map, with what was filled; `count` gets its figures."""
+    shift_m, sigma_m = (0.0, 0.0) if tie is None else (tie.shift_m, tie.sigma_m)
+    names = ("elevation", "sigma", "count", *(("flags",) if count is not None else ()))
+    for where, layers in _windows(result, names, progress):
+        layers["elevation"] = layers["elevation"] + np.float32(shift_m)
+        if tie is not None:
+            layers["sigma"] = np.hypot(layers["sigma"], np.float32(sigma_m))
+        if count is not None:
+            count(tile_figures(layers))
+        if result.filled is not None:
+            fill, fill_sigma = (result.store.read(name, where) for name in FILL_LAYERS)
+            wider = np.hypot(fill_sigma, np.float32(sigma_m))
+            layers = with_fill(layers, fill + np.float32(shift_m), wider)
+        yield where, layers
+
+
+def _bits(layers: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[np.uint8]]:
+    """Return a tile's flags as they stand in the file."""
+    return {"flags": np.nan_to_num(layers["flags"], nan=NO_FLAGS).astype(np.uint8)}
 
 
 def _tiled_figures(result: TiledSurvey, figures: dict[str, Any]) -> dict[str, Any]:
@@ -182,13 +191,13 @@ def _write_shared(
     survey: Survey,
     result: SurveyMap | TiledSurvey,
     pings: Sequence[npt.NDArray[Any]],
-    tie: Tie | None,
+    tie: HeightTie | None,
 ) -> dict[str, Any]:
     """Write tracks, soundings, objects and the prior map's changes; return what is known of the survey."""
     write_trajectory(out / "trajectory.csv", from_true_north(result.track))
     write_trajectory(out / "trajectory-navigated.csv", from_true_north(result.raw_track))
     write_tracks(out / "tracks.gpkg", result.track, result.raw_track)
-    write_soundings(out / "soundings.csv", result.corrected, 0.0 if tie is None else tie.shift_m)
+    write_soundings(out / "soundings.csv", result.corrected, tie)
     write_graph(out, result.corrected)
     write_rounds(out / "rounds.csv", result.corrected.diagnostics.rounds)
     changes = out / "prior-changes.gpkg"
@@ -245,13 +254,14 @@ def _write_objects(
     }
 
 
-def write_soundings(path: Path, corrected: CorrectedSurvey, shift_m: float = 0.0) -> None:
+def write_soundings(path: Path, corrected: CorrectedSurvey, tie: HeightTie | None = None) -> None:
     """Write what the first returns alone say of the floor below the corrected track.
 
     Parameters
     ----------
-    shift_m : added to the heights: the map's tie to a prior one is the soundings' as well.
+    tie : the map's tie to a prior one is the soundings' as well.
     """
+    shift_m, tie_sigma_m = (0.0, 0.0) if tie is None else (tie.shift_m, tie.sigma_m)
 
     def heights(strip: ElevationStrip, offset_m: float) -> npt.NDArray[Any]:
         return -(strip.depth_m + strip.altitude_m) + offset_m + shift_m
@@ -261,7 +271,7 @@ def write_soundings(path: Path, corrected: CorrectedSurvey, shift_m: float = 0.0
         np.concatenate([s.easting_m for s in strips]),
         np.concatenate([s.northing_m for s in strips]),
         np.concatenate([heights(s, o) for s, o in zip(strips, corrected.height_m, strict=True)]),
-        np.concatenate([s.altitude_sigma_m for s in strips]),
+        np.hypot(np.concatenate([s.altitude_sigma_m for s in strips]), tie_sigma_m),
     ]
     with whole_file(path) as temporary:
         np.savetxt(

@@ -15,6 +15,7 @@ import numpy as np
 
 from mapping.fixes import PositionFix
 from mapping.fusion import fuse
+from mapping.incremental import pass_by_pass
 from mapping.one_sided import hold_one_sided
 from mapping.survey import CorrectedSurvey, correct_survey
 from perception.attitude import levelled
@@ -34,6 +35,7 @@ from perception.records import (
     silent,
 )
 from perception.strips import PassResult, StripConfig, common_samples, known_depth
+from scenarios.map_loop import check_prior, refine_on_map, tied_to_prior
 from scenarios.passes import strips_of
 
 if TYPE_CHECKING:
@@ -107,6 +109,7 @@ def map_survey(
     method: str = "joint",
     passes: Sequence[PassSummary] | None = None,
     prior: Grid | None = None,
+    incremental: bool = False,
     progress: Progress = silent,
 ) -> SurveyMap:
     """Turn the passes of a survey into one map and one corrected track.
@@ -117,9 +120,11 @@ def map_survey(
     method : "joint" inverts shading, shadows and soundings of all passes on one grid;
         "shadow" fuses the strips of shadow heights.
     passes : results of `build_passes` where they are at hand.
+    incremental : correct the track pass by pass instead of all at once.
     """
+    check_prior(prior, survey.crs, survey.datum)
     results = build_passes(survey, progress) if passes is None else tuple(passes)
-    corrected = _corrected(survey, results, fixes, method, prior, progress)
+    corrected = _corrected(survey, results, fixes, method, prior, incremental, progress)
     track = whole_track(survey, corrected.trajectory)
     # The joint method has shadows and shading of its own: of the strips it is held to the soundings.
     strips = corrected.strips if method == "shadow" else _floors(results, corrected)
@@ -152,17 +157,23 @@ def _corrected(
     fixes: Sequence[PositionFix],
     method: str,
     prior: Grid | None,
+    incremental: bool,
     progress: Progress,
 ) -> CorrectedSurvey:
-    """Correct the track by registration, on the map's own drafts, and by a prior map where one is given."""
-    from scenarios.map_loop import refine_on_map, tied_to_prior
+    """Correct the track by registration, on the map's own drafts, and by a prior map where one is given.
+
+    Pass by pass no draft is made: it would match every pass anew.
+    """
 
     def looks(corrected: CorrectedSurvey) -> list[Look]:
         return looks_of(survey, results, corrected)
 
     navigated = [result.strip for result in results]
-    corrected = correct_survey(navigated, fixes, progress=progress)
-    if method == "joint":
+    if incremental:
+        corrected = pass_by_pass(navigated, fixes, progress=progress)
+    else:
+        corrected = correct_survey(navigated, fixes, progress=progress)
+    if method == "joint" and not incremental:
         corrected = refine_on_map(navigated, corrected, looks, fixes, survey.crs, progress)
     if prior is None:
         return corrected

@@ -23,6 +23,7 @@ _FIX_REACH_S = 3600.0  # fixes further from every ping say nothing of the survey
 if TYPE_CHECKING:
     from mapping.fixes import PositionFix
     from perception.bottom_files import GivenBottom
+    from perception.installation import Installation
     from perception.readers import Survey
     from perception.records import Grid, Progress
 
@@ -32,6 +33,41 @@ def _finite(ctx: click.Context, param: click.Parameter, value: float | None) -> 
     if value is not None and not math.isfinite(value):
         raise click.BadParameter(f"{value} is no length; give metres, as {param.opts[0]} 0.5")
     return value
+
+
+@dataclass(frozen=True, slots=True)
+class _Options:
+    """What the command line asks for, by the options' own names."""
+
+    cell: float | None
+    crs: str | None
+    prior: Path | None
+    fixes: Path | None
+    install: Path | None
+    tide: Path | None
+    sound_speed: str | None
+    bottom: Path | None
+    method: str | None
+    fill_m: float | None
+    also: tuple[str, ...]
+    incremental: bool
+    tiles: bool
+    tile_cells: int
+    scheduler: str | None
+    workers: int | None
+
+    @property
+    def tiling(self) -> _Tiling:
+        return _Tiling(self.tiles, self.tile_cells, self.scheduler, self.workers)
+
+
+@dataclass(frozen=True, slots=True)
+class _Files:
+    """The files that the options name, read before any work is done."""
+
+    fixes: list[PositionFix]
+    prior: Grid | None
+    bottom: GivenBottom | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +117,11 @@ class _Tiling:
     help="The map in another format as well, beside map.tif.",
 )
 @click.option(
+    "--incremental",
+    is_flag=True,
+    help="Correct the track pass by pass, each as it comes, instead of all at once.",
+)
+@click.option(
     "--tiles", is_flag=True, help="Make the map in tiles; the default beyond 25 million cells."
 )
 @click.option(
@@ -93,27 +134,7 @@ class _Tiling:
 @click.option("--scheduler", help="Dask scheduler (tcp://HOST:PORT) whose workers make the tiles.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes that make tiles here.")
 @common_options
-def command(
-    surveys: tuple[Path, ...],
-    out: Path,
-    cell: float | None,
-    crs: str | None,
-    prior: Path | None,
-    fixes: Path | None,
-    install: Path | None,
-    tide: Path | None,
-    sound_speed: str | None,
-    bottom: Path | None,
-    method: str | None,
-    fill_m: float | None,
-    also: tuple[str, ...],
-    tiles: bool,
-    tile_cells: int,
-    scheduler: str | None,
-    workers: int | None,
-    quiet: bool,
-    verbose: bool,
-) -> None:
+def command(surveys: tuple[Path, ...], out: Path, quiet: bool, verbose: bool, **given: Any) -> None:
     """Turn the passes in SURVEY files into one map with sigma and a corrected track.
 
     \b
@@ -122,54 +143,79 @@ def command(
     """
     import time
 
-    from mapping.exports import check_frame
-    from mapping.fixes import read_fixes
-    from mapping.rasters import read_map
-    from perception.bottom_files import read_bottom
-    from perception.installation import read_installation
     from perception.readers import open_survey
-    from scenarios.map_loop import check_prior
     from scenarios.outputs import write_metrics
 
+    options = _Options(**given)
     set_verbosity(quiet, verbose)
-    _check_formats(also)
+    _check_formats(options.also)
     prepare_out(out)
-    absolute = read_fixes(fixes) if fixes is not None else []
-    old = read_map(prior) if prior is not None else None
-    installation = read_installation(install, tide, sound_speed)
-    given = read_bottom(bottom) if bottom is not None else None
+    files = _read(options)
+    installation = _installation(options)
     began = time.perf_counter()
     with progress_bars(quiet) as progress:
-        survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
+        survey = open_survey(surveys, crs=options.crs, installation=installation, progress=progress)
         if not quiet:
             for warning in survey.warnings:
                 click.echo(f"note: {warning}", err=True)
-        if absolute:
-            check_fixes(fixes, absolute, survey)
-        check_prior(old, survey.crs, survey.datum)
-        check_frame(also, survey.crs)
-        tiling = _Tiling(tiles, tile_cells, scheduler, workers)
-        method, in_tiles = _choose(survey, cell, method, tiling, quiet)
+        _check_frames(options, files, survey)
+        tiling = options.tiling
+        method, in_tiles = _choose(survey, options.cell, options.method, tiling, quiet)
         if in_tiles:
-            _refuse_bottom(bottom)
-            metrics = _in_tiles(out, survey, absolute, cell, tiling, old, fill_m, progress)
+            _refuse_in_tiles(options)
+            metrics = _in_tiles(out, survey, files, options, progress)
         else:
             if not quiet:
                 _tell_unused(tiling)
-            metrics = _in_one_piece(
-                out, survey, absolute, cell, method, old, fill_m, given, progress
-            )
-        _export(out, also)
-    config = {
-        "surveys": [str(p) for p in surveys], "cell_m": cell, "crs": survey.crs, "method": method,
-        "prior": prior, "fixes": fixes, "install": install, "tide": tide,
-        "sound_speed": sound_speed, "bottom": bottom, "tile_cells": tile_cells if in_tiles else None,
-        "also": list(also) or None, "fill_m": fill_m,
-    }  # fmt: skip
+            metrics = _in_one_piece(out, survey, files, options, method, progress)
+        _export(out, options.also)
     metrics["seconds"] = time.perf_counter() - began
-    write_metrics(out, metrics, config)
+    write_metrics(out, metrics, _config(surveys, survey, options, method, in_tiles))
     if not quiet:
         _tell(metrics, out)
+
+
+def _read(options: _Options) -> _Files:
+    from mapping.fixes import read_fixes
+    from mapping.rasters import read_map
+    from perception.bottom_files import read_bottom
+
+    return _Files(
+        fixes=read_fixes(options.fixes) if options.fixes is not None else [],
+        prior=read_map(options.prior) if options.prior is not None else None,
+        bottom=read_bottom(options.bottom) if options.bottom is not None else None,
+    )
+
+
+def _installation(options: _Options) -> Installation | None:
+    from perception.installation import read_installation
+
+    return read_installation(options.install, options.tide, options.sound_speed)
+
+
+def _check_frames(options: _Options, files: _Files, survey: Survey) -> None:
+    """Refuse what does not fit the survey's time, coordinate system or datum, before any work is done."""
+    from mapping.exports import check_frame
+    from scenarios.map_loop import check_prior
+
+    if files.fixes:
+        check_fixes(options.fixes, files.fixes, survey)
+    check_prior(files.prior, survey.crs, survey.datum)
+    check_frame(options.also, survey.crs)
+
+
+def _config(
+    surveys: tuple[Path, ...], survey: Survey, options: _Options, method: str, in_tiles: bool
+) -> dict[str, Any]:
+    """Return the settings as `config.toml` keeps them."""
+    return {
+        "surveys": [str(p) for p in surveys], "cell_m": options.cell, "crs": survey.crs,
+        "method": method, "prior": options.prior, "fixes": options.fixes,
+        "install": options.install, "tide": options.tide, "sound_speed": options.sound_speed,
+        "bottom": options.bottom, "tile_cells": options.tile_cells if in_tiles else None,
+        "also": list(options.also) or None, "fill_m": options.fill_m,
+        "incremental": options.incremental or None,
+    }  # fmt: skip
 
 
 def _check_formats(also: tuple[str, ...]) -> None:
@@ -244,66 +290,63 @@ def _tell_unused(tiling: _Tiling) -> None:
         )
 
 
-def _refuse_bottom(bottom: Path | None) -> None:
+def _refuse_in_tiles(options: _Options) -> None:
     from perception.records import InputError
 
-    if bottom is not None:
+    if options.bottom is not None:
         raise InputError(
-            f"--bottom {bottom}: a map in tiles tracks its own bottom; leave --tiles out, or --bottom"
+            f"--bottom {options.bottom}: a map in tiles tracks its own bottom; leave --tiles out, or "
+            "--bottom"
+        )
+    if options.incremental:
+        raise InputError(
+            "--incremental: a map in tiles is made of all passes at once; leave --tiles out, or "
+            "--incremental"
         )
 
 
 def _in_one_piece(
-    out: Path,
-    survey: Survey,
-    fixes: list[PositionFix],
-    cell_m: float | None,
-    method: str,
-    old: Grid | None,
-    fill_m: float | None,
-    given: GivenBottom | None,
-    progress: Progress,
+    out: Path, survey: Survey, files: _Files, options: _Options, method: str, progress: Progress
 ) -> dict[str, Any]:
+    from mapping.height_tie import tie_heights
     from perception.strips import StripConfig
-    from scenarios.map_files import tie_to_prior, write_whole
+    from scenarios.map_files import write_whole
     from scenarios.survey_map import build_passes, map_survey
 
     passes = None
-    if given is not None:
-        passes = build_passes(survey, progress, StripConfig(given_bottom=given))
+    if files.bottom is not None:
+        passes = build_passes(survey, progress, StripConfig(given_bottom=files.bottom))
     result = map_survey(
         survey,
-        fixes=fixes,
-        cell_m=cell_m,
+        fixes=files.fixes,
+        cell_m=options.cell,
         method=method,
         passes=passes,
-        prior=old,
+        prior=files.prior,
+        incremental=options.incremental,
         progress=progress,
     )
     # Tied before anything is written: every file of the folder is of one height.
-    tie = None if old is None else tie_to_prior(result.grid, old)
-    return write_whole(out, survey, result, tie, fill_m) | ({} if tie is None else tie.metrics())
+    tie = None if files.prior is None else tie_heights(result.grid, files.prior)
+    written = write_whole(out, survey, result, tie, options.fill_m)
+    return written | ({} if tie is None else tie.metrics())
 
 
 def _in_tiles(
-    out: Path,
-    survey: Survey,
-    fixes: list[PositionFix],
-    cell_m: float | None,
-    tiling: _Tiling,
-    old: Grid | None,
-    fill_m: float | None,
-    progress: Progress,
+    out: Path, survey: Survey, files: _Files, options: _Options, progress: Progress
 ) -> dict[str, Any]:
-    from scenarios.map_files import tie_to_prior, write_tiled
+    from mapping.height_tie import tie_heights
+    from scenarios.map_files import write_tiled
     from scenarios.survey_tiles import map_tiles
 
     result = map_tiles(
-        survey, out / "tiles", fixes=fixes, prior=old, cell_m=cell_m, tile_cells=tiling.tile_cells,
-        fill_m=fill_m, scheduler=tiling.scheduler, workers=tiling.workers, progress=progress,
+        survey, out / "tiles", fixes=files.fixes, prior=files.prior, cell_m=options.cell,
+        tile_cells=options.tile_cells, fill_m=options.fill_m, scheduler=options.scheduler,
+        workers=options.workers, progress=progress,
     )  # fmt: skip
-    tie = None if old is None else tie_to_prior(result.overview(), old)
-    return write_tiled(out, survey, result, tie, progress) | ({} if tie is None else tie.metrics())
+    tie = None if files.prior is None else tie_heights(result.overview(), files.prior)
+    written = write_tiled(out, survey, result, tie, progress)
+    return written | ({} if tie is None else tie.metrics())
 
 
 def _export(out: Path, also: tuple[str, ...]) -> None:
