@@ -87,12 +87,18 @@ def _inverse_diagonal(diagonal: FloatArray, off: FloatArray) -> FloatArray:
 
 
 def learn_roughness(
-    floor_m: FloatArray, sigma_m: FloatArray, along_m: FloatArray, reach_m: float
+    floor_m: FloatArray,
+    sigma_m: FloatArray,
+    along_m: FloatArray,
+    reach_m: float,
+    between_objects: bool = False,
 ) -> Roughness:
     """Learn the variogram from the soundings of a pass, their own noise taken off.
 
-    Lags run from a few pings to `reach_m` or half the pass, evenly in their logarithm.
+    Lags run from a few pings to `reach_m` or half the pass, evenly in their logarithm. `between_objects` learns
+    it by medians: of most of the ground, whatever objects under the track or a cliff add.
     """
+    half_square = _half_median_square if between_objects else _half_square
     known = np.isfinite(floor_m)
     floor, along = floor_m[known], along_m[known]
     if len(floor) < 8 or np.ptp(along) <= 0:
@@ -104,7 +110,7 @@ def learn_roughness(
     top = min(max(reach_m, 4 * step), 0.5 * length)
     lags = np.unique(np.geomspace(1, max(2, top / step), 14).astype(int))
     lags = lags[lags < len(even)]
-    values = np.array([_half_square(even[k:] - even[:-k]) for k in lags])
+    values = np.array([half_square(even[k:] - even[:-k]) for k in lags])
     values = np.maximum(values - noise, 0.05 * values) + 1e-12
     counts = len(even) / lags
     # Far lags have few independent pairs; near ones are mostly noise.
@@ -128,6 +134,11 @@ def _half_square(differences: FloatArray) -> float:
     root = float(np.mean(np.sqrt(np.abs(differences))))
     robust = 0.5 * root**4 / (0.457 + 0.494 / count)
     return 0.5 * (robust + 0.5 * float(np.mean(np.square(differences))))
+
+
+def _half_median_square(differences: FloatArray) -> float:
+    """Return half the mean square that normal differences with this median size would have."""
+    return 0.5 * float(np.median(np.abs(differences)) / 0.6745) ** 2
 
 
 def least_range_bias(altitude_m: FloatArray, roughness: Roughness) -> tuple[FloatArray, FloatArray]:

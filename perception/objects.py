@@ -79,6 +79,7 @@ class _Side:
     sample_m: float
     track: Track
     roughness: Roughness | None
+    ground: Roughness | None
     config: ObjectConfig
 
 
@@ -109,6 +110,7 @@ def find_objects(
     track: Track,
     pass_index: int,
     roughness: Roughness | None = None,
+    ground: Roughness | None = None,
     config: ObjectConfig | None = None,
 ) -> list[ObjectRow]:
     """Find what may be objects and craters of one side of a pass; `listed_objects` says what is listed.
@@ -119,7 +121,8 @@ def find_objects(
     levels : labels and statistics of the same samples.
     sample_m : range of a sample.
     side : -1 port, 1 starboard.
-    roughness : of the floor between objects; None takes a flat floor.
+    roughness : of the floor, against which an object stands out; None takes a flat floor.
+    ground : of the floor between objects, which tells what a height's base leaves open; None as `roughness`.
 
     Returns
     -------
@@ -131,7 +134,7 @@ def find_objects(
     )
     budget = config.fits + int(config.fits_per_ping * len(ratio))
     least = sorted((shadow.cells for shadow in shadows), reverse=True)[:budget][-1:]
-    seen = _Side(marks, ratio, levels, sample_m, track, roughness, config)
+    seen = _Side(marks, ratio, levels, sample_m, track, roughness, ground or roughness, config)
     rows = []
     for shadow in shadows:
         fitted = shadow.cells >= least[0]
@@ -183,10 +186,10 @@ def _edges(shadow: Shadow, seen: _Side) -> _Edges:
     drop = float(seen.track.altitude_m[row])
     start_m, end_m = (int(edge[peak]) * seen.sample_m for edge in (shadow.start, shadow.end))
     floor_sigma = 0.0
-    if seen.roughness is not None:
+    if seen.ground is not None:
         # The floor at the shadow's end against the floor below the sonar.
         away = np.sqrt(max(end_m**2 - drop**2, 0.0))
-        floor_sigma = float(np.sqrt(seen.roughness.variogram(np.array(away))))
+        floor_sigma = float(np.sqrt(seen.ground.variogram(np.array(away))))
     return _Edges(
         start_m, end_m, drop, float(np.hypot(seen.track.altitude_sigma_m[row], floor_sigma))
     )
@@ -258,10 +261,10 @@ def _relief(half_size_m: float, edges: _Edges, seen: _Side) -> float:
     the variogram. The floor at the shadow's end lies above or below the object's foot by a difference of its own:
     ``dH = z_end Rs / (Rs + Ls)``.
     """
-    if seen.roughness is None:
+    if seen.ground is None:
         return 0.0
     ground = [float(ground_range(np.array(v), np.array(edges.drop_m))) for v in (edges.start_m, edges.end_m)]  # fmt: skip
-    ring, end = seen.roughness.variogram(np.array([half_size_m, ground[1] - ground[0]]))
+    ring, end = seen.ground.variogram(np.array([half_size_m, ground[1] - ground[0]]))
     return float(np.sqrt(0.5 * ring + 2 * end * (edges.start_m / edges.end_m) ** 2))
 
 

@@ -153,7 +153,10 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
 
 @dataclass(frozen=True, slots=True)
 class _Lines:
-    """The floor below the sonar, levelled over all lines of a pass: (n,) each."""
+    """The floor below the sonar, levelled over all lines of a pass: (n,) each.
+
+    `roughness` is the floor's, `ground` that of the floor between objects.
+    """
 
     along_m: FloatArray
     height_m: FloatArray
@@ -161,6 +164,7 @@ class _Lines:
     altitude_m: FloatArray
     first_return_m: FloatArray
     roughness: Roughness
+    ground: Roughness
     reach_m: float
 
 
@@ -178,7 +182,9 @@ def _level(
     # Where within its sample the first echo began is the same unknown on every line: averaging many does
     # not take it away.
     line_sigma = np.sqrt(line_sigma**2 + (0.3 * sample_m) ** 2 + short_sigma**2)
-    return _Lines(along_m, line_m, line_sigma, -depth_m - line_m, bottom.first_return_m, rough, reach_m)  # fmt: skip
+    ground = learn_roughness(sounded, bottom.sigma_m, along_m, reach_m, between_objects=True)
+    return _Lines(along_m, line_m, line_sigma, -depth_m - line_m, bottom.first_return_m, rough,
+                  ground, reach_m)  # fmt: skip
 
 
 def _look(
@@ -197,7 +203,7 @@ def _look(
                              side * swath.roll_rad, config.gain)  # fmt: skip
         levels = segment_levels(equalised.ratio, equalised.looks, config.levels)
         found = find_objects(equalised.ratio, levels, sample_m, side, track, swath.pass_index,
-                             lines.roughness, config.objects)  # fmt: skip
+                             lines.roughness, lines.ground, config.objects)  # fmt: skip
         return equalised, levels, found
 
     # Both sides at once: the kernels let go of the interpreter's lock, and share nothing.
