@@ -21,6 +21,7 @@ class CellFlag(IntFlag):
     SHADOW = 8  # no sound fell here: the height is inferred
     HIGHLIGHT = 16  # far brighter than the floor around
     SURFACE_RETURN = 32  # the echo of the sea's surface lies on this range
+    AMBIGUOUS = 64  # another surface has the same range: the echo is both surfaces' (layover)
 
 
 # So many samples at one and the same greatest value are the recorder's ceiling, not chance.

@@ -23,6 +23,7 @@ from perception.contours import (
 )
 from perception.gain import Equalised, GainConfig, equalise
 from perception.geometry import progress_along, resample_rows
+from perception.layover import layover_cells
 from perception.levels import LevelConfig, Levels, segment_levels
 from perception.objects import (
     ObjectConfig,
@@ -32,7 +33,7 @@ from perception.objects import (
     find_objects,
     listed_objects,
 )
-from perception.quality import cell_flags, saturated_samples
+from perception.quality import CellFlag, cell_flags, saturated_samples
 from perception.readers.raw import PingFlag
 from perception.records import BoolArray, ElevationStrip, FloatArray, InputError, IntArray, Swath
 from perception.strip_columns import add_object, columns_across, lay_on_columns
@@ -136,6 +137,8 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
     echo = sides[0][0].ratio, sides[1][0].ratio
     cells = cell_flags(swath, saturated, labels, echo, tracked.valid, along_m, lines.altitude_m,
                        strip.across_m, sample_m)  # fmt: skip
+    folded = layover_cells(strip.elevation_m, strip.across_m, -swath.depth_m, sample_m)
+    cells |= folded * np.uint8(CellFlag.AMBIGUOUS)
     return PassResult(
         strip=replace(strip, lead_m=lead_m, flags=cells),
         floor=replace(floor, lead_m=lead_m, flags=cells),
