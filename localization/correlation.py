@@ -20,6 +20,8 @@ from perception.records import BoolArray, FloatArray
 _LEAST_OVERLAP = 0.4
 # Side of the map in the coarse search: rotation by rotation, 256 cells are enough to find peaks.
 _COARSE_SIDE = 300
+# A patch of fewer cells a side is searched at half of a cell.
+_FINE_SIDE = 24
 # Points of the patch that verify a hypothesis: more do not sharpen it and cost time.
 _VERIFY_POINTS = 4000
 # Log likelihood ratio between best and second place: e^12 covers a million places tried.
@@ -27,9 +29,9 @@ _DISTINCT = 12.0
 # The best of all wrong places reaches 20 to 30: e^18 places and turns on a thousand cells a side, each
 # fitted. As sure again as above, and some for ground that repeats itself.
 _CHANCE = 45.0
-# Places are ranked without what a Gaussian of this part of the patch keeps (of 3, 6, 12 the last ranked
+# Places are ranked without what a Gaussian of this part of the patch, or of these cells, keeps (of 3, 6, 12 the last ranked
 # best, docs/terrain-navigation.md); octaves of fewer values are left out.
-_LONGEST_PART, _FEWEST_VALUES = 12.0, 10.0
+_LONGEST_PART, _SHARPEST, _FEWEST_VALUES = 12.0, 2.0, 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +150,10 @@ def match_patch(
     Matching
         Never empty; without relief or overlap the one hypothesis has correlation -1.
     """
-    thin = max(1, round(max(values.shape) / _COARSE_SIDE)) if turn_rad is None else 1
+    thin = float(max(1, round(max(values.shape) / _COARSE_SIDE))) if turn_rad is None else 1.0
+    if min(patch.shape) < _FINE_SIDE:
+        # Of few wide cells, half a cell beside the place no short wave fits any more.
+        thin = 0.5
     coarse_map, coarse_patch = _thinned(values, thin), _thinned(patch, thin)
     turns = (
         np.arange(0.0, 2 * np.pi - step_rad / 2, step_rad)
@@ -168,10 +173,16 @@ def match_patch(
     return found
 
 
-def _thinned(values: FloatArray, every: int) -> FloatArray:
-    """Average blocks of `every` cells, holes left out."""
-    if every == 1:
+def _thinned(values: FloatArray, thin: float) -> FloatArray:
+    """Average blocks of `thin` cells, holes left out; below 1 interpolate between cells."""
+    if thin == 1:
         return values
+    if thin < 1:
+        finer: FloatArray = ndimage.zoom(
+            values, 1 / thin, order=1, grid_mode=True, mode="nearest"
+        )
+        return finer
+    every = int(thin)
     rows, cols = (n // every * every for n in values.shape)
     blocks = values[:rows, :cols].reshape(rows // every, every, cols // every, every)
     known = np.isfinite(blocks)
@@ -200,7 +211,7 @@ def _candidates(
     values: FloatArray,
     patch: FloatArray,
     turns: FloatArray,
-    thin: int,
+    thin: float,
     shape: tuple[int, ...],
 ) -> list[Match]:
     """Return the places that fit best over all turns, in cells of the full map.
@@ -210,7 +221,7 @@ def _candidates(
     ``-log(1 - ncc^2)``: the same correlation over half of the patch says half as much.
     """
     side = int(np.ceil(np.hypot(*patch.shape))) if len(turns) > 1 else max(patch.shape)
-    width = min(patch.shape) / _LONGEST_PART
+    width = max(min(patch.shape) / _LONGEST_PART, _SHARPEST)
     sharp, fine = _sharpened(patch, width), _sharpened(values, width)
     spectra = _Spectra(fine, (side, side))
     least = _LEAST_OVERLAP * float(np.isfinite(patch).sum())

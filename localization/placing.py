@@ -1,8 +1,8 @@
 """A patch of sea floor placed anywhere in a map: position, heading, how sure, and which places rival it.
 
-Two ways, one answer: on the raster itself (`correlation`, every heading tried), or on the compact map of
-hills and hollows (`constellation`), which a vehicle carries in a hundredth of the bytes. Patch and map
-need not have one cell size: both are brought to the map's.
+Two ways, one answer: on the raster itself (`correlation`, every heading tried), or on a map that a vehicle
+carries in a hundredth of the bytes (`compact`). Patch and map need not have one cell size: both are brought
+to the map's.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import ndimage
 
-from localization.constellation import Constellation, Landmarks, find_landmarks
-from localization.correlation import match_patch, smoothed
+from localization.compact import CompactMap, match_compact
+from localization.constellation import Placement
+from localization.correlation import Match, match_patch
 from localization.integrity import protection_level
-from localization.maperror import assumed_sigma, filter_map
+from localization.rescaled import cells_of, in_cells, without_white_error
 from perception.records import FloatArray, Grid, InputError
 
 # A patch of fewer known cells of the map's tells nothing.
 _FEWEST_CELLS = 200
 # 1-sigma of a place from reading both rasters between their cells, in cells and for each axis.
 _BETWEEN = 0.03
-# Cells that agree to this part are of one size.
-_SAME = 1e-6
+# Places nearer than this, in cells of the thumbnail, are one and the same told twice.
+_ONE_PLACE = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +55,7 @@ class Place:
 class Placing:
     """Places, likeliest first; whether the first may be used, and why.
 
-    `ambiguity` is the probability that one of the others kept is the right one, all places alike beforehand;
-    `carried_bytes` the size of the map that was matched against.
+    `carried_bytes` is the size of the map that was matched against.
     """
 
     places: tuple[Place, ...]
@@ -66,6 +65,7 @@ class Placing:
 
     @property
     def ambiguity(self) -> float:
+        """Probability that another of the places kept is the right one, all alike beforehand."""
         if len(self.places) < 2:
             return 0.0 if self.accepted else math.nan
         above = np.array([p.evidence - self.places[0].evidence for p in self.places])
@@ -80,92 +80,77 @@ def place_on_raster(prior: Grid, patch: Grid, turn_rad: float | None = None) -> 
     InputError
         The patch holds too few heights, or is larger than the map.
     """
-    prior, patch = _alike(prior, patch)
-    found = match_patch(_without_white_error(prior), patch.elevation_m, turn_rad)
-    cell = prior.cell_m
-    # Rows run southward: north is minus the row.
-    axes = np.array([[0.0, cell, 0.0], [-cell, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    places = tuple(
-        Place(
-            easting_m=prior.west_m + (m.col + 0.5) * cell,
-            northing_m=prior.north_m - (m.row + 0.5) * cell,
-            turn_rad=m.turn_rad,
-            covariance=axes @ m.covariance @ axes.T
-            + np.diag([1.0, 1.0, 0.0]) * (_BETWEEN * cell) ** 2,
-            evidence=m.evidence,
-        )
-        for m in found.hypotheses
-        if m.evidence > 0
-    )
-    return Placing(
-        places, found.accepted and bool(places), found.reason, 4 * prior.elevation_m.size
-    )
-
-
-def place_on_landmarks(prior: Grid, patch: Grid, turn_rad: float | None = None) -> Placing:
-    """Place a patch by its hills and hollows on those of the map; arguments as `place_on_raster`."""
-    prior, patch = _alike(prior, patch)
-    packed = find_landmarks(prior).packed()
-    # The patch's landmarks are counted from its centre, so that the shift is the centre's place.
-    rows, cols = patch.shape
-    half_e, half_n = cols * patch.cell_m / 2, rows * patch.cell_m / 2
-    marks = find_landmarks(replace(patch, west_m=-half_e, north_m=half_n))
-    found = Constellation(Landmarks.unpacked(packed)).match(marks, turn_rad)
-    places = tuple(
-        Place(h.easting_m, h.northing_m, h.turn_rad, h.covariance, h.score)
-        for h in found.hypotheses
-    )
-    return Placing(places, found.accepted, found.reason, len(packed))
-
-
-def _without_white_error(prior: Grid) -> FloatArray:
-    """Heights less the map's white error: its slopes would pass for the ground's, and for certainty."""
-    height, sigma = prior.elevation_m, prior.sigma_m
-    if sigma is None:
-        sigma = np.full(height.shape, assumed_sigma(abs(float(np.nanmedian(height)))))
-    return filter_map(height, sigma, prior.cell_m, prior.cell_north_m)[0]
-
-
-def _alike(prior: Grid, patch: Grid) -> tuple[Grid, Grid]:
-    """Bring both to square cells of the map's size; refuse what cannot be placed."""
-    cell = max(prior.cell_m, prior.cell_north_m)
+    cell = cells_of(prior)
     prior, patch = in_cells(prior, cell), in_cells(patch, cell)
-    known = int(np.isfinite(patch.elevation_m).sum())
-    if known < _FEWEST_CELLS:
-        raise InputError(
-            f"the patch holds {known} heights on cells of {cell:g} m (the map's); "
-            f"at least {_FEWEST_CELLS} are needed: give a larger patch or a finer map"
-        )
+    _refuse_small(patch)
     if max(patch.shape) > 2 * max(prior.shape):
         raise InputError(
             f"the patch ({patch.shape[1] * cell:.0f} by {patch.shape[0] * cell:.0f} m) is larger than "
             f"the map ({prior.shape[1] * cell:.0f} by {prior.shape[0] * cell:.0f} m); are they swapped?"
         )
-    return prior, patch
+    found = match_patch(without_white_error(prior), patch.elevation_m, turn_rad)
+    frame = (prior.west_m, prior.north_m, cell)
+    places = tuple(_of_match(m, frame) for m in found.hypotheses if m.evidence > 0)
+    size = 4 * prior.elevation_m.size
+    return Placing(places, found.accepted and bool(places), found.reason, size)
 
 
-def in_cells(grid: Grid, cell_m: float) -> Grid:
-    """Resample a raster to square cells: averaged over the wider cell, or interpolated to a finer one."""
-    ratio = np.array([cell_m / grid.cell_north_m, cell_m / grid.cell_m])
-    if np.all(np.abs(ratio - 1.0) < _SAME):
-        return grid
-    values = grid.elevation_m
-    # A cell's mean is a box; a Gaussian of its standard deviation keeps as much and does not alias.
-    width = np.sqrt(np.maximum(ratio**2 - 1.0, 0.0) / 12.0)
-    if width.max() > 0:
-        values = smoothed(values, width)
-    # Whole cells about the same centre: it is the centre that is placed.
-    rows, cols = (max(int(n / k), 1) for n, k in zip(grid.shape, ratio, strict=True))
-    row, col = np.meshgrid(
-        (np.arange(rows) - (rows - 1) / 2) * ratio[0] + (grid.shape[0] - 1) / 2,
-        (np.arange(cols) - (cols - 1) / 2) * ratio[1] + (grid.shape[1] - 1) / 2,
-        indexing="ij",
+def place_on_compact(carried: CompactMap, patch: Grid, turn_rad: float | None = None) -> Placing:
+    """Place a patch on a compact map; arguments as `place_on_raster`.
+
+    Raises
+    ------
+    InputError
+        The patch holds too few heights.
+    """
+    _refuse_small(in_cells(patch, carried.fine_m))
+    # Counted from the patch's centre, a shift is the centre's place.
+    half_e, half_n = (patch.east_m - patch.west_m) / 2, (patch.north_m - patch.south_m) / 2
+    found = match_compact(carried, replace(patch, west_m=-half_e, north_m=half_n), turn_rad)
+    frame = (carried.west_m, carried.north_m, carried.cell_m)
+    places = [_of_match(m, frame) for m in found.thumbnail.hypotheses if m.evidence > 0]
+    places += [_of_placement(h) for h in found.landmarks.hypotheses]
+    size = len(carried.packed())
+    if found.best is None:
+        return Placing((), False, found.reason, size)
+    if isinstance(found.best, Match):
+        best = _of_match(found.best, frame)
+    else:
+        best = _of_placement(found.best)
+
+    def told_of_best(p: Place) -> bool:
+        away = np.hypot(p.easting_m - best.easting_m, p.northing_m - best.northing_m)
+        return bool(away < _ONE_PLACE * carried.cell_m)
+
+    # Of one place told by both, the stronger word counts.
+    evidence = max((p.evidence for p in places if told_of_best(p)), default=best.evidence)
+    others = sorted((p for p in places if not told_of_best(p)), key=lambda p: -p.evidence)
+    return Placing((replace(best, evidence=evidence), *others), found.accepted, found.reason, size)
+
+
+def _of_match(m: Match, frame: tuple[float, float, float]) -> Place:
+    """A place in rows and columns of a raster of west edge, north edge and cell, as one in metres."""
+    west, north, cell = frame
+    # Rows run southward: north is minus the row.
+    axes = np.array([[0.0, cell, 0.0], [-cell, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    between = np.diag([1.0, 1.0, 0.0]) * (_BETWEEN * cell) ** 2
+    return Place(
+        easting_m=west + (m.col + 0.5) * cell,
+        northing_m=north - (m.row + 0.5) * cell,
+        turn_rad=m.turn_rad,
+        covariance=axes @ m.covariance @ axes.T + between,
+        evidence=m.evidence,
     )
-    read = ndimage.map_coordinates(values, [row, col], order=1, mode="nearest")
-    west = 0.5 * (grid.west_m + grid.east_m - cols * cell_m)
-    north = 0.5 * (grid.north_m + grid.south_m + rows * cell_m)
-    sigma = None
-    if grid.sigma_m is not None and np.isfinite(grid.sigma_m).any():
-        # Errors of neighbouring cells may be alike: an average is not taken to be better than its cells.
-        sigma = np.where(np.isfinite(read), float(np.nanmedian(grid.sigma_m)), np.nan)
-    return Grid(read, west, north, cell_m, grid.crs, sigma, datum=grid.datum)
+
+
+def _of_placement(h: Placement) -> Place:
+    return Place(h.easting_m, h.northing_m, h.turn_rad, h.covariance, h.score)
+
+
+def _refuse_small(patch: Grid) -> None:
+    known = int(np.isfinite(patch.elevation_m).sum())
+    if known < _FEWEST_CELLS:
+        raise InputError(
+            f"the patch holds {known} heights on cells of {patch.cell_m:g} m (the map's); "
+            f"at least {_FEWEST_CELLS} are needed: give a larger patch or a finer map"
+        )

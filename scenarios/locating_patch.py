@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from localization.placing import Place, Placing, place_on_landmarks, place_on_raster
+from localization.compact import CompactMap
+from localization.placing import Place, Placing, place_on_compact, place_on_raster
 from mapping.rasters import read_map
 from perception.files import write_text
 from perception.geodesy import convergence, is_local
@@ -23,7 +24,7 @@ def place_patch(
     Parameters
     ----------
     heading_deg : azimuth of the patch's own north from true north, where it is known.
-    compact : match the map's hills and hollows alone.
+    compact : match the map's hills, hollows and thumbnail alone, a hundredth of its bytes.
 
     Raises
     ------
@@ -37,9 +38,11 @@ def place_patch(
     prior, patch = read_map(prior_path), read_map(patch_path)
     middle = (0.5 * (prior.west_m + prior.east_m), 0.5 * (prior.south_m + prior.north_m))
     turn = None if heading_deg is None else np.radians(heading_deg) - _convergence(prior, *middle)
-    place = place_on_landmarks if compact else place_on_raster
     try:
-        placing = place(prior, patch, turn)
+        if compact:
+            placing = place_on_compact(CompactMap.of(prior), patch, turn)
+        else:
+            placing = place_on_raster(prior, patch, turn)
     except InputError as error:
         raise InputError(f"{patch_path} on {prior_path}: {error}") from error
     metrics = summary(placing, prior, patch)

@@ -166,6 +166,7 @@ def draw_placing(path: Path, prior: Grid, patch: Grid, placing: Placing) -> None
         cmap="viridis", interpolation="nearest",
     )  # fmt: skip
     figure.colorbar(image, ax=left, label="elevation (m)", shrink=0.75)
+    left.set_facecolor("0.75")
     half_e = 0.5 * (patch.east_m - patch.west_m)
     half_n = 0.5 * (patch.north_m - patch.south_m)
     corners = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1], [-1, -1]]) * (half_e, half_n)
@@ -190,7 +191,7 @@ def draw_placing(path: Path, prior: Grid, patch: Grid, placing: Placing) -> None
     left.ticklabel_format(useOffset=False, style="plain")
     left.tick_params(axis="x", labelrotation=30)
     if placing.places:
-        figure.legend(loc="outside lower left", ncols=2, fontsize=8)
+        figure.legend(loc="outside lower left", ncols=2, fontsize=8, facecolor="0.75")
     right.imshow(
         patch.elevation_m, extent=(-half_e, half_e, -half_n, half_n), cmap="viridis",
         interpolation="nearest",

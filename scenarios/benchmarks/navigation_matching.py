@@ -1,12 +1,12 @@
 """Benchmark `navigation-matching`: a patch of 100 x 100 cells placed on a map of 1,000 x 1,000.
 
 The sea floor is the fractal of `navigation_sets`, read anew for each patch with splines at its own turn
-and place, with 1 m of white noise; the map has 0.3 m. Methods, as `bathynav locate --patch` has them: the constellation
-of peaks and pits on a compact map (`--compact`), and correlation on the raster itself, each with the
-heading unknown and known. Patches are whole, have holes (shadows) over a quarter of them, or lie partly off
-the map.
+and place, with 1 m of white noise; the map has 0.3 m. Methods, as `bathynav locate --patch` has them: the
+compact map of landmarks and thumbnail (`--compact`) and the raster itself, each with the heading unknown
+and known; landmarks alone beside them. Patches are whole, have holes (shadows) over a quarter of them, or lie
+partly off the map.
 
-`BATHYNAV_PATCHES` sets the number of patches for each ground and harm (default 12); correlation over all
+`BATHYNAV_PATCHES` sets the number of patches for each ground and harm (default 12); the raster over all
 headings takes seconds a patch and gets the first quarter of them. A match is right within 5 cells and 5 degrees.
 """
 
@@ -19,8 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.constellation import find_landmarks
-from localization.placing import Placing, place_on_landmarks, place_on_raster
+from localization.compact import CompactMap
+from localization.constellation import Constellation, Landmarks, find_landmarks
+from localization.placing import Place, Placing, place_on_compact, place_on_raster
 from perception.records import FloatArray, Grid, Progress
 from scenarios.benchmarks import Row, Table
 from scenarios.benchmarks.navigation_sets import Floor, SetConfig, spectral_floor
@@ -50,25 +51,37 @@ def run(progress: Progress) -> Table:
         rng = np.random.default_rng([int(relief), 20261122])
         floor = spectral_floor(config, rng)
         prior = _map_of(floor, rng)
-        share = len(find_landmarks(prior).packed()) / (4.0 * prior.elevation_m.size)
-        rows.append(Row(ground, "constellation", "map carried", 100 * share, "% of raster", "<= 1"))
-        methods = _methods(prior)
+        carried = CompactMap.of(prior)
+        share = len(carried.packed()) / (4.0 * prior.elevation_m.size)
+        rows.append(Row(ground, "compact map", "map carried", 100 * share, "% of raster", "<= 1"))
+        methods = _methods(carried, prior)
         for harm in ("whole", "a quarter of holes", "a third off the map"):
             patches = [draw_patch(floor, rng, harm) for _ in range(number)]
             for k, (name, method) in enumerate(methods.items()):
                 progress(f"{ground}, {harm}", k, len(methods))
-                slow = name == "correlation, heading unknown"
+                slow = name == "raster, heading unknown"
                 chosen = patches[: max(number // 4, 3)] if slow else patches
                 rows += _measure(f"{ground}, {harm}", name, method, chosen)
     return Table("navigation-matching", tuple(rows), {"patches": number})
 
 
-def _methods(prior: Grid) -> dict[str, Callable[[Placed], Placing]]:
+def _methods(carried: CompactMap, prior: Grid) -> dict[str, Callable[[Placed], Placing]]:
+    constellation = Constellation(Landmarks.unpacked(carried.landmarks))
+
+    def by_marks(patch: Placed) -> Placing:
+        found = constellation.match(find_landmarks(patch.grid))
+        places = tuple(
+            Place(h.easting_m, h.northing_m, h.turn_rad, h.covariance, h.score)
+            for h in found.hypotheses
+        )
+        return Placing(places, found.accepted, found.reason, len(carried.landmarks))
+
     return {
-        "constellation, heading unknown": lambda p: place_on_landmarks(prior, p.grid),
-        "constellation, heading known": lambda p: place_on_landmarks(prior, p.grid, p.turn_rad),
-        "correlation, heading unknown": lambda p: place_on_raster(prior, p.grid),
-        "correlation, heading known": lambda p: place_on_raster(prior, p.grid, p.turn_rad),
+        "landmarks alone, heading unknown": by_marks,
+        "compact map, heading unknown": lambda p: place_on_compact(carried, p.grid),
+        "compact map, heading known": lambda p: place_on_compact(carried, p.grid, p.turn_rad),
+        "raster, heading unknown": lambda p: place_on_raster(prior, p.grid),
+        "raster, heading known": lambda p: place_on_raster(prior, p.grid, p.turn_rad),
     }
 
 

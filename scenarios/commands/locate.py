@@ -33,7 +33,7 @@ from scenarios.commands.console import (
 @click.option("--path", "path_m", type=click.FloatRange(min=1), default=300.0, show_default=True, help="Length of track for --observability, m.")  # fmt: skip
 @click.option("--patch", type=click.Path(path_type=Path), help="Raster of sea floor to place anywhere in the map, in its own axes.")  # fmt: skip
 @click.option("--heading", type=click.FloatRange(-360.0, 360.0), help="Azimuth of the patch's own north, degrees, where it is known; else every heading is tried.")  # fmt: skip
-@click.option("--compact", is_flag=True, help="Place --patch by the map's hills and hollows alone, a hundredth of its bytes.")  # fmt: skip
+@click.option("--compact", is_flag=True, help="Place --patch by a hundredth of the map's bytes: its hills, hollows and a thumbnail.")  # fmt: skip
 @click.option("--follow", is_flag=True, help="Read rows (CSV or JSON lines) from standard input, write estimates as they come.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.")
 @common_options

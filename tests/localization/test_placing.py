@@ -8,7 +8,9 @@ import navsets
 import numpy as np
 import pytest
 
-from localization.placing import Placing, in_cells, place_on_landmarks, place_on_raster
+from localization.compact import CompactMap
+from localization.placing import Placing, place_on_compact, place_on_raster
+from localization.rescaled import in_cells
 from perception.records import Grid, InputError
 
 CENTRE_M = (612.5, 587.0)
@@ -97,12 +99,19 @@ def test_a_map_that_repeats_itself_is_ambiguous() -> None:
     assert placing.ambiguity > 0.01
 
 
-def test_hills_and_hollows_alone_do_not_place_what_is_not_there() -> None:
+def test_a_hundredth_of_the_map_places_a_patch() -> None:
+    carried = CompactMap.of(prior())
+    data = carried.packed()
+    assert (
+        len(data) < 0.015 * 4 * prior().elevation_m.size
+    )  # 0.01 on a map of a thousand cells a side
+    assert_placed(place_on_compact(CompactMap.unpacked(data), patch(side_m=500.0)), 25.0)
+
+
+def test_a_hundredth_of_the_map_does_not_place_what_is_not_there() -> None:
     rng = np.random.default_rng(5)
     other = rng.standard_normal((100, 100)).cumsum(axis=0).cumsum(axis=1) / 20
-    placing = place_on_landmarks(prior(), Grid(other, 0.0, 0.0, 5.0))
-    assert not placing.accepted
-    assert placing.carried_bytes < 0.02 * 4 * prior().elevation_m.size
+    assert not place_on_compact(CompactMap.of(prior()), Grid(other, 0.0, 0.0, 5.0)).accepted
 
 
 @pytest.mark.parametrize(
