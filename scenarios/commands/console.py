@@ -34,8 +34,11 @@ def set_verbosity(quiet: bool, verbose: bool) -> None:
     level = logging.ERROR if quiet else logging.INFO if verbose else logging.WARNING
     logging.getLogger().setLevel(level)
     # Third parties tell their own stories at INFO; ours are the ones asked for.
-    for name in ("rasterio", "fiona", "pyogrio", "numba", "matplotlib", "distributed"):
+    for name in ("numba", "matplotlib", "distributed"):
         logging.getLogger(name).setLevel(max(level, logging.WARNING))
+    # GDAL's own words (CPLE_...) mean nothing to a user, and its failures arrive as exceptions besides.
+    for name in ("rasterio", "fiona", "pyogrio"):
+        logging.getLogger(name).setLevel(logging.WARNING if verbose else logging.CRITICAL)
 
 
 def prepare_out(out: Path) -> Path:

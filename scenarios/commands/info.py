@@ -149,7 +149,13 @@ def _track(survey: Survey) -> list[tuple[str, str]]:
     clock = f"{_utc(time_s.min())} to {_utc(time_s.max())} UTC" if survey.utc else "no date"
     duration_s = float(np.ptp(time_s))
     step_s = np.diff(time_s)
-    rate = f", a ping every {np.median(step_s):.3g} s" if len(step_s) else ""
+    # The mean between gaps: a clock that moves in steps makes the commonest interval shorter than the true one.
+    running = (
+        step_s[(step_s >= 0) & (step_s <= max(5.0, 10 * float(np.median(step_s))))]
+        if len(step_s)
+        else step_s
+    )
+    rate = f", a ping every {running.mean():.3g} s" if len(running) else ""
     length_m = _length_m(survey, used)
     speed = f", {length_m / duration_s:.2f} m/s on average" if duration_s > 0 else ""
     east, north = table.easting_m[used], table.northing_m[used]

@@ -10,23 +10,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from perception.files import write_text
 from perception.geodesy import GEOGRAPHIC, is_local, transform
-from perception.records import FloatArray
+from perception.object_table import ObjectTable
+from perception.records import FloatArray, IntArray
 from perception.strips import PassResult
 
 # A snippet shows so many shadow lengths (and at least metres) about its object, on so many dots a side.
 _LEAST_M, _MOST_DOTS = 3.0, 180
 # Beyond this many contacts a page is no report; the least likely are left to objects.csv.
 _MOST = 400
+# A card names so many parts.
+_MOST_PARTS = 8
 # Contacts of two passes and kinds nearer than this (or their own size) dispute each other.
 _SAME_M = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """One object of one pass as the page shows it; metres, `snippet` a PNG."""
+    """One object of one pass as the page shows it; metres, `snippet` a PNG.
+
+    `parts` : what touches it, in words: a wreck's hull, mast and holes are one contact, told by its highest part.
+    """
 
     easting_m: float
     northing_m: float
@@ -42,30 +49,66 @@ class Contact:
     pass_index: int
     ping: int
     snippet: bytes
+    parts: tuple[str, ...] = ()
 
 
 def contacts_of(result: PassResult) -> list[Contact]:
-    """Return the contacts of one pass with their echo snippets."""
+    """Return the contacts of one pass with their echo snippets; objects that touch are one contact."""
     table = result.objects
-    return [
-        Contact(
-            easting_m=float(table.easting_m[i]),
-            northing_m=float(table.northing_m[i]),
-            kind=table.kind[i],
-            height_m=float(table.height_m[i]),
-            sigma_m=float(table.sigma_m[i]),
-            lower_bound=bool(table.lower_bound[i]),
-            probability=float(table.probability[i]),
-            slant_range_m=float(table.slant_range_m[i]),
-            shadow_length_m=float(table.shadow_length_m[i]),
-            across_m=float(table.across_m[i]),
-            half_size_m=float(max(table.half_across_m[i], table.half_along_m[i])),
-            pass_index=int(table.pass_index[i]),
-            ping=int(table.ping[i]),
-            snippet=_snippet(result, i),
-        )
-        for i in range(len(table))
-    ]
+    contacts = []
+    for members in touching(table):
+        # The least height of a shadow that leaves the swath tells less of a contact than a measured one.
+        rank = np.where(table.lower_bound[members], 0.5, 1.0) * table.height_m[members]
+        i, *others = members[np.argsort(-rank)]
+        contacts.append(replace(_contact(result, int(i)), parts=_parts(table, others)))
+    return contacts
+
+
+def _contact(result: PassResult, i: int) -> Contact:
+    table = result.objects
+    return Contact(
+        easting_m=float(table.easting_m[i]),
+        northing_m=float(table.northing_m[i]),
+        kind=table.kind[i],
+        height_m=float(table.height_m[i]),
+        sigma_m=float(table.sigma_m[i]),
+        lower_bound=bool(table.lower_bound[i]),
+        probability=float(table.probability[i]),
+        slant_range_m=float(table.slant_range_m[i]),
+        shadow_length_m=float(table.shadow_length_m[i]),
+        across_m=float(table.across_m[i]),
+        half_size_m=float(max(table.half_across_m[i], table.half_along_m[i])),
+        pass_index=int(table.pass_index[i]),
+        ping=int(table.ping[i]),
+        snippet=_snippet(result, i),
+    )
+
+
+def touching(table: ObjectTable) -> list[IntArray]:
+    """Return the rows of one pass in groups whose footprints or shadows touch, in the order of the rows.
+
+    Each object takes a rectangle of one side's echo: its footprint along the track, and in slant range from half a
+    footprint before its shadow to the shadow's end.
+    """
+    if not len(table):
+        return []
+    near = table.slant_range_m - table.half_across_m
+    far = table.slant_range_m + table.shadow_length_m
+    low, high = table.along_m - table.half_along_m, table.along_m + table.half_along_m
+    same_side = np.sign(table.across_m)[:, None] == np.sign(table.across_m)
+    meet = same_side & (near[:, None] <= far) & (near <= far[:, None])
+    meet &= (low[:, None] <= high) & (low <= high[:, None])
+    count, group = connected_components(meet, directed=False)
+    return [np.flatnonzero(group == number) for number in range(count)]
+
+
+def _parts(table: ObjectTable, rows: Sequence[int]) -> tuple[str, ...]:
+    """Return the parts of a contact in words, the highest first."""
+    return tuple(
+        f"{table.kind[i]}, {'at least ' if table.lower_bound[i] else ''}"
+        f"{table.height_m[i]:.2f} m &plusmn; {table.sigma_m[i]:.2f} m, ping {table.ping[i]}"
+        for i in rows
+    )
 
 
 def pictured(contacts: Sequence[Contact]) -> list[Contact]:
@@ -177,11 +220,13 @@ def _card(number: int, contact: Contact, place: str, disputed: bool) -> str:
         ("shadow", f"{contact.shadow_length_m:.2f} m{', runs out of the swath' if least else ''}"),
         ("pass, ping", f"{contact.pass_index}, {contact.ping}"),
         ("probability", f"{contact.probability:.0%}"),
+        *(("part", part) for part in contact.parts[:_MOST_PARTS]),
     ]
+    of = f" of {1 + len(contact.parts)} parts" if contact.parts else ""
     lines = "".join(f"<dt>{name}</dt><dd>{value}</dd>" for name, value in rows if value)
     return (
         f'<article><img alt="echo of contact {number}" src="data:image/png;base64,{picture}">'
-        f"<div><h2>{number}. {contact.kind}</h2>{mark}<dl>{lines}</dl></div></article>"
+        f"<div><h2>{number}. {contact.kind}{of}</h2>{mark}<dl>{lines}</dl></div></article>"
     )
 
 
@@ -203,7 +248,8 @@ dt {{ color: #5a6772; }} dd {{ margin: 0; font-variant-numeric: tabular-nums; }}
 <h1>Contacts</h1>
 <p>{title}. {said} Positions in {crs}. Each picture has the track to the right and range upwards, to one scale
 on both axes: black is shadow, white a highlight. Heights are above the surrounding floor, with 1-sigma;
-the probability is that of an object against the floor's own relief.</p>
+the probability is that of an object against the floor's own relief. Objects of one pass whose footprints or
+shadows touch are one contact, told by its highest part; objects.csv lists every part.</p>
 <main>
 {cards}
 </main></body></html>

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from perception.object_table import ObjectRow, ObjectTable
 from perception.strips import build_strip
-from scenarios.report.contacts import contacts_of, pictured, write_contacts
+from scenarios.report.contacts import contacts_of, pictured, touching, write_contacts
 from tests.perception.echo_fixtures import Survey, box, make_swath
 
 CRS = "EPSG:32619"
@@ -50,3 +51,38 @@ def test_only_contacts_that_the_page_shows_keep_their_pictures() -> None:
     assert [replace(c, snippet=contact.snippet) for c in kept] == many
     assert [bool(c.snippet) for c in kept] == [False] * 500 + [True] * 400
     assert pictured(many[:600]) == many[:600]
+
+
+def _row(
+    across_m: float, along_m: float, slant_range_m: float, shadow_length_m: float
+) -> ObjectRow:
+    return ObjectRow(
+        easting_m=0.0, northing_m=0.0, kind="hill", height_m=1.0, sigma_m=0.1,
+        slant_range_m=slant_range_m, shadow_length_m=shadow_length_m, pass_index=0, ping=0,
+        across_m=across_m, along_m=along_m, half_across_m=1.0, half_along_m=1.5,
+    )  # fmt: skip
+
+
+def test_objects_whose_footprints_or_shadows_touch_are_one_contact() -> None:
+    hull, mast, in_shadow = _row(20, 50, 22, 4), _row(22, 52.5, 24, 9), _row(29, 54, 32, 2)
+    apart, other_side = _row(20, 60, 22, 4), _row(-20, 50, 22, 4)
+    groups = touching(ObjectTable.of([hull, apart, mast, other_side, in_shadow]))
+    # The mast touches the hull, and what stands in the mast's shadow touches the mast.
+    assert [list(group) for group in groups] == [[0, 2, 4], [1], [3]]
+    assert touching(ObjectTable.of([])) == []
+
+
+def test_a_contact_is_told_by_its_highest_part_and_names_the_others(tmp_path: Path) -> None:
+    low, high = box(0.7, 15, 10, 0.8, 0.8), box(1.2, 16, 13.2, 0.8, 0.8)
+    swath = make_swath(
+        lambda x, y: low(x, y) + high(x, y), Survey(n_pings=90, n_samples=500),
+        np.random.default_rng(5),
+    )  # fmt: skip
+    result = build_strip(swath)
+    wide = replace(result.objects, half_along_m=result.objects.half_along_m + 1.0)
+    contacts = contacts_of(replace(result, objects=wide))
+    assert len(result.objects) == 2 and len(contacts) == 1
+    assert contacts[0].height_m == result.objects.height_m.max() and len(contacts[0].parts) == 1
+    write_contacts(tmp_path / "contacts.html", contacts, "survey.xtf", CRS)
+    page = (tmp_path / "contacts.html").read_text()
+    assert "hill of 2 parts" in page and page.count("<dt>part</dt>") == 1
