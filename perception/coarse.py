@@ -38,7 +38,11 @@ class CoarseSolver:
         """
         factor = linalg.splu(matrix.tocsc(), options={"SymmetricMode": True},
                              diag_pivot_thresh=0.0, permc_spec="MMD_AT_PLUS_A")  # fmt: skip
-        answer = factor.solve(border)
+        # Gains that no datum ties to the fields have nothing to solve for.
+        tied = np.flatnonzero(border.any(axis=0))
+        answer = np.zeros_like(border)
+        if len(tied):
+            answer[:, tied] = factor.solve(border[:, tied])
         return cls(factor, answer, np.linalg.inv(gain_block - border.T @ answer))
 
     def solve(

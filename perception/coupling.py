@@ -67,7 +67,7 @@ class Coupling:
             carried = dense[:, _BAND].copy()
             for kind, part in enumerate(parts):
                 own = dense[kind, : min(_BAND, nodes[0] - first)]
-                part.append(sparse.csr_matrix(own.reshape(-1, knots)))
+                part.append(_sparse(own.reshape(-1, knots)))
         return cls(nodes, *(sparse.csr_matrix(sparse.vstack(part, "csr")) for part in parts))
 
     def coarser(self, prolongation: sparse.csr_matrix) -> Coupling:
@@ -98,6 +98,35 @@ class Coupling:
     def dense(self) -> FloatArray:
         """Return the coupling as (2 nodes, knots)."""
         return np.asarray(sparse.vstack([self.height, self.albedo]).toarray(), float)
+
+
+def _sparse(dense: FloatArray) -> sparse.csr_matrix:
+    start = np.zeros(len(dense) + 1, np.int32)
+    start[1:] = np.cumsum(count_entries(dense))
+    column, value = np.empty(start[-1], np.int32), np.empty(start[-1], dense.dtype)
+    take_entries(dense, column, value)
+    return sparse.csr_matrix((value, column, start), shape=dense.shape)
+
+
+@njit(cache=True, nogil=True)
+def count_entries(dense):
+    """Return the number of entries of each row that are not zero."""
+    out = np.zeros(dense.shape[0], np.int32)
+    for i in range(dense.shape[0]):
+        for j in range(dense.shape[1]):
+            out[i] += dense[i, j] != 0
+    return out
+
+
+@njit(cache=True, nogil=True)
+def take_entries(dense, column, value):
+    """Write column and value of all entries that are not zero, row by row."""
+    k = 0
+    for i in range(dense.shape[0]):
+        for j in range(dense.shape[1]):
+            if dense[i, j] != 0:
+                column[k], value[k] = j, dense[i, j]
+                k += 1
 
 
 @njit(cache=True, nogil=True)

@@ -13,8 +13,8 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def trace_rays(z, frame, window, rays, power, dark, law, sums, passed):
-    """Add the facets of all rays to `sums` (cells of the window, weight and columns), mark `passed`.
+def trace_rays(z, frame, window, rays, power, dark, law, weights, sums, passed):
+    """Add the facets of all rays to `weights` and `sums` (cells of the window, columns), mark `passed`.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def trace_rays(z, frame, window, rays, power, dark, law, sums, passed):
         predict(ray, law, height, angle, slant, last, begin, energy, predicted)
         compare(
             ray, frame, window, law, height, slant, begin, energy, last, predicted, observed, known,
-            dark[i], sums,
+            dark[i], weights, sums,
         )  # fmt: skip
 
 
@@ -168,7 +168,8 @@ def curvature(height, j, last, step):
 
 @njit(cache=True, nogil=True)
 def compare(
-    ray, frame, window, law, height, slant, begin, energy, last, predicted, observed, known, dark, sums,
+    ray, frame, window, law, height, slant, begin, energy, last, predicted, observed, known, dark,
+    weights, sums,
 ):  # fmt: skip
     """Add each lit facet's comparison to the sums of its cell."""
     exponent, step, floor = law
@@ -201,16 +202,16 @@ def compare(
         bend = share * (exponent / t - (exponent - 1) * t / (1 + t * t)) * r2 / (lever * lever)
         ratio = 2 * np.log(max(between(observed, a, b), 1e-3 * floor * pre) / pre)
         weight = num * (1.0 - begin[j])
+        weights[q] += weight
         line = sums[q]
-        line[0] += weight
-        line[1] += weight * bend * ux
-        line[2] += weight * bend * uy
+        line[0] += weight * bend * ux
+        line[1] += weight * bend * uy
         rise = 1 + p * p - d * curvature(height, j, last, step)
-        line[3] -= weight * bend * rise / lever
-        line[4] += weight * ratio
-        line[5] += weight * g
-        line[6] += weight * d
-        line[7] += weight * p
-        line[8] += weight * (np.arctan2(g, d) + ray[4])
-        line[9] += weight * np.sqrt(r2)
-        line[10] += weight * share
+        line[2] -= weight * bend * rise / lever
+        line[3] += weight * ratio
+        line[4] += weight * g
+        line[5] += weight * d
+        line[6] += weight * p
+        line[7] += weight * (np.arctan2(g, d) + ray[4])
+        line[8] += weight * np.sqrt(r2)
+        line[9] += weight * share

@@ -174,6 +174,24 @@ def advance(first, last, right, applied, diagonal, keep, gain, step, x):
             x[i, j] += step[i, j]
 
 
+@njit(cache=True, fastmath=True, nogil=True)
+def dot_rows(first, last, u, v, out):
+    """Write the rows' inner products."""
+    for i in range(first, last):
+        total = 0.0
+        for j in range(u.shape[1]):
+            total += u[i, j] * v[i, j]
+        out[i] = total
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def add_rows(first, last, factor, value, out):
+    """Add `factor` times `value`."""
+    for i in range(first, last):
+        for j in range(value.shape[1]):
+            out[i, j] += factor * value[i, j]
+
+
 @njit(cache=True, nogil=True)
 def prolong_rows(first, last, coarse, fine):
     """Write rows of the bilinear interpolation of `coarse` to the grid of half its cell."""

@@ -9,6 +9,7 @@ tracks explain nearly the same echoes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,17 +19,19 @@ from perception.bands import over_bands
 from perception.coarse import CoarseSolver, level_matrix
 from perception.coupling import Coupling
 from perception.level_kernels import (
+    add_rows,
     advance,
     apply_corners,
     apply_features,
+    dot_rows,
     prolong_rows,
     restrict_rows,
 )
 from perception.records import FloatArray, IntArray
 from perception.stencils import coarsen_local, local_of_moments
 
-# Nodes that a direct factorisation takes in a fraction of a second.
-COARSEST_NODES = 5000
+# Nodes that are solved directly. More of them take no step off the solution and cost more than the grid they save.
+COARSEST_NODES = 1200
 # Places of the diagonal in a packed upper triangle of 8 rows.
 _DIAGONAL = [8 * k - k * (k - 1) // 2 for k in range(8)]
 # The diagonally scaled operator has no eigenvalue beyond the number of unknowns that one cell ties together;
@@ -125,12 +128,15 @@ class Tie:
     def of(cls, matrix: sparse.csr_matrix, weight: FloatArray) -> Tie:
         # In order now: `read` shares its values, which a sorting later on would move under it.
         matrix.sum_duplicates()
-        return cls(matrix, weight, np.unique(matrix.indices))
+        used = np.zeros(matrix.shape[1], np.bool_)
+        used[matrix.indices] = True
+        return cls(matrix, weight, np.flatnonzero(used))
 
     def __post_init__(self) -> None:
-        place = np.searchsorted(self.nodes, self.matrix.indices)
+        place = np.zeros(self.matrix.shape[1], np.int32)
+        place[self.nodes] = np.arange(len(self.nodes))
         read = sparse.csr_matrix(
-            (self.matrix.data, place, self.matrix.indptr),
+            (self.matrix.data, place[self.matrix.indices], self.matrix.indptr),
             shape=(self.matrix.shape[0], len(self.nodes)),
         )
         object.__setattr__(self, "read", read)
@@ -205,22 +211,30 @@ class Level:
 
         A smoother built on too small a value makes errors grow and conjugate gradients fail.
         """
-        scale = tuple(1 / np.sqrt(d) for d in self.diagonal)
+        scale = [1 / np.sqrt(d) for d in self.diagonal]
         rng = np.random.default_rng(0)
-        v = np.stack([rng.standard_normal(self.shape) for _ in range(2)])
-        v /= np.linalg.norm(v)
-        before = np.zeros_like(v)
-        on, off = [], [0.0]
-        for _ in range(min(_LANCZOS_STEPS, v.size)):
-            w = np.stack(self.apply(scale[0] * v[0], scale[1] * v[1])) * scale
-            on.append(float(np.vdot(v, w)))
-            w -= on[-1] * v + off[-1] * before
-            off.append(float(np.linalg.norm(w)))
-            if off[-1] < 1e-9 * on[0]:
+        v: list[FloatArray] = [rng.standard_normal(self.shape) for _ in scale]
+        before: list[FloatArray] = [np.zeros(self.shape) for _ in scale]
+        on: list[float] = []
+        off: list[float] = []
+        norm = float(np.sqrt(dot(v, v)))
+        for _ in range(min(_LANCZOS_STEPS, 2 * v[0].size)):
+            for part in v:
+                part /= norm
+            w = self.apply(scale[0] * v[0], scale[1] * v[1])
+            for part, s in zip(w, scale, strict=True):
+                part *= s
+            on.append(dot(v, w))
+            add_times(w, -on[-1], v)
+            if off:
+                add_times(w, -off[-1], before)
+            norm = float(np.sqrt(dot(w, w)))
+            if norm < 1e-9 * on[0]:
                 break
-            before, v = v, w / off[-1]
-        small = np.diag(on) + np.diag(off[1 : len(on)], 1) + np.diag(off[1 : len(on)], -1)
-        return float(np.linalg.eigvalsh(small)[-1])
+            off.append(norm)
+            before, v = v, list(w)
+        rest = off[: len(on) - 1]
+        return float(np.linalg.eigvalsh(np.diag(on) + np.diag(rest, 1) + np.diag(rest, -1))[-1])
 
     def smooth(self, z: FloatArray, a: FloatArray, b_z: FloatArray, b_a: FloatArray) -> None:
         """Damp the upper part of the spectrum of the error of (z, a) by a Chebyshev polynomial, in place."""
@@ -237,6 +251,28 @@ class Level:
                 over_bands(advance, x.shape[0], x.size, b, y, d, keep, gain, s, x)
             following = 1 / (2 * sigma - rho)
             keep, gain, rho = following * rho, 2 * following / half, following
+
+
+def dot(u: Sequence[FloatArray], v: Sequence[FloatArray]) -> float:
+    """Return the inner product of fields; the same whatever the number of threads."""
+    total = 0.0
+    for x, y in zip(u, v, strict=True):
+        if x.ndim == 1:
+            total += float(np.sum(x * y))
+            continue
+        parts = np.empty(x.shape[0])
+        over_bands(dot_rows, x.shape[0], x.size, x, y, parts)
+        total += float(np.sum(parts))
+    return total
+
+
+def add_times(x: Sequence[FloatArray], factor: float, y: Sequence[FloatArray]) -> None:
+    """Add `factor` times the fields `y` to `x`, in place."""
+    for out, value in zip(x, y, strict=True):
+        if out.ndim == 1:
+            out += factor * value
+        else:
+            over_bands(add_rows, out.shape[0], out.size, factor, value, out)
 
 
 def prolong(coarse: FloatArray) -> FloatArray:

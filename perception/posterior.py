@@ -17,7 +17,7 @@ from scipy import sparse
 from perception.bands import over_bands
 from perception.coupling import Coupling
 from perception.level_kernels import prior_rows
-from perception.multigrid import Hierarchy, Spectrum, Tie, can_halve
+from perception.multigrid import Hierarchy, Spectrum, Tie, add_times, can_halve, dot
 from perception.records import FloatArray, IntArray
 from perception.stencils import (
     accumulate_moments,
@@ -181,31 +181,22 @@ class Problem:
         Stops where the error, as the preconditioner measures it, is `tolerance` posterior sigmas in all:
         no combination of heights is then further from the solution than that, however the data scale.
         """
-        x: Fields = start
-        y = self.apply(*(np.ascontiguousarray(part) for part in x))
-        r: Fields = _along(right, -1.0, y)
-        s = self.hierarchy.cycle(*r)
-        p = s
-        rs = _dot(r, s)
+        x: Fields = (start[0].copy(), start[1].copy(), start[2].copy())
+        r: Fields = (right[0].copy(), right[1].copy(), right[2].copy())
+        add_times(r, -1.0, self.apply(*x))
+        p = self.hierarchy.cycle(*r)
+        rs = dot(r, p)
         if rs <= tolerance**2:
             return x, 0
         for k in range(most):
             y = self.apply(*p)
-            alpha = rs / _dot(p, y)
-            x = _along(x, alpha, p)
-            r = _along(r, -alpha, y)
+            alpha = rs / dot(p, y)
+            add_times(x, alpha, p)
+            add_times(r, -alpha, y)
             s = self.hierarchy.cycle(*r)
-            following = _dot(r, s)
+            following = dot(r, s)
             if following <= tolerance**2:
                 return x, k + 1
-            p = _along(s, following / rs, p)
-            rs = following
+            add_times(s, following / rs, p)
+            p, rs = s, following
         return x, most
-
-
-def _along(x: Fields, step: float, p: Fields) -> Fields:
-    return x[0] + step * p[0], x[1] + step * p[1], x[2] + step * p[2]
-
-
-def _dot(a: Fields, b: Fields) -> float:
-    return float(sum(np.vdot(u, v) for u, v in zip(a, b, strict=True)))

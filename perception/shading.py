@@ -60,7 +60,7 @@ class Rows:
     look: IntArray
 
 
-# Columns of the sums that `trace_rays` fills, after the weight itself.
+# Columns of the weighted sums that `trace_rays` fills.
 _COLUMNS = (
     "c_east", "c_north", "c_level", "ratio", "ground_m", "drop_m", "slope", "angle_rad", "slant_m",
     "share",
@@ -118,25 +118,24 @@ def _trace_one(
 ) -> tuple[dict[str, npt.NDArray[Any]], IntArray]:
     """Return one pass and side's columns, and the cells that its rays cross."""
     window = _window(surface.shape, frame, ray)
-    sums = np.zeros((window[2] * window[3], len(_COLUMNS) + 1))
-    passed = np.zeros(len(sums), np.bool_)
+    weight = np.zeros(window[2] * window[3])
+    sums = np.zeros((len(weight), len(_COLUMNS)))
+    passed = np.zeros(len(weight), np.bool_)
     poses = np.stack(
         [ray.easting_m, ray.northing_m, ray.up_m, ray.azimuth_rad, ray.tilt_rad, ray.sample_m]
     )
-    trace_rays(surface, frame, window, poses, ray.power, hidden, law, sums, passed)
+    trace_rays(surface, frame, window, poses, ray.power, hidden, law, weight, sums, passed)
 
     def whole(place: IntArray) -> IntArray:
         row, col = np.divmod(place, window[3])
         return (row + window[0]) * (surface.shape[1] - 1) + col + window[1]
 
-    lit = np.flatnonzero(sums[:, 0] > 0)
-    weight = sums[lit, 0]
-    columns: dict[str, npt.NDArray[Any]] = {
-        name: (sums[lit, k] / weight).astype(np.float32) for k, name in enumerate(_COLUMNS, start=1)
-    }
+    lit = np.flatnonzero(weight > 0)
+    means = (sums[lit] / weight[lit, None]).T.astype(np.float32)
+    columns: dict[str, npt.NDArray[Any]] = dict(zip(_COLUMNS, means, strict=True))
     columns |= {
         "cell": whole(lit),
-        "samples": weight.astype(np.float32),
+        "samples": weight[lit].astype(np.float32),
         "side": np.full(len(lit), ray.side, np.int8),
         "look": np.full(len(lit), ray.look, np.int16),
     }
