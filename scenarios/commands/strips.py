@@ -15,10 +15,13 @@ from scenarios.commands.console import (
     progress_bars,
     set_verbosity,
 )
+from scenarios.outputs import write_metrics
 
 if TYPE_CHECKING:
     from perception.objects import ObjectTable
-    from perception.strips import PassResult
+    from perception.readers import Survey
+    from perception.records import Progress
+    from perception.strips import PassResult, StripConfig
     from scenarios.report.contacts import Contact
 
 
@@ -58,19 +61,10 @@ def command(
     \b
     bathynav strips survey.xtf --out strips
     """
-    import time
-
-    from perception.bottom_files import bottom_rows, read_bottom, write_bottom_csv
+    from perception.bottom_files import read_bottom
     from perception.installation import read_installation
-    from perception.objects import ObjectTable, write_objects_csv
     from perception.readers import open_survey
-    from perception.strip_files import write_strip
     from perception.strips import StripConfig
-    from scenarios.outputs import write_metrics
-    from scenarios.passes import strips_of
-    from scenarios.plots_strips import plot_pass
-    from scenarios.report.contacts import contacts_of, pictured, write_contacts
-    from scenarios.survey_map import PassSummary, keep_passes
 
     set_verbosity(quiet, verbose)
     prepare_out(out)
@@ -81,7 +75,35 @@ def command(
         None if cell is None and given is None else StripConfig(cell_m=cell, given_bottom=given)
     )
     installation = read_installation(install, tide, sound_speed)
+    with progress_bars(quiet) as progress:
+        survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
+        if not quiet:
+            for warning in survey.warnings:
+                click.echo(f"note: {warning}", err=True)
+        metrics = _write_passes(out, survey, config, _title(surveys), progress)
+    settings = {"surveys": [str(p) for p in surveys], "crs": survey.crs, "cell_m": cell}
+    write_metrics(out, metrics, {**settings, "bottom": bottom})
+    if not quiet:
+        print_table("strips", [(name, _shown(value)) for name, value in metrics.items()])
+        click.echo(f"written to {out}")
+
+
+def _write_passes(
+    out: Path, survey: Survey, config: StripConfig | None, title: str, progress: Progress
+) -> dict[str, Any]:
+    """Write every pass's strip and picture, then what is told of all: objects, contacts, bottom; return metrics."""
+    import time
+
+    from perception.bottom_files import bottom_rows, write_bottom_csv
+    from perception.objects import ObjectTable, write_objects_csv
+    from perception.strip_files import write_strip
+    from scenarios.passes import strips_of
+    from scenarios.plots_strips import plot_pass
+    from scenarios.report.contacts import contacts_of, pictured, write_contacts
+    from scenarios.survey_map import PassSummary, keep_passes
+
     began = time.perf_counter()
+    given = config is not None and config.given_bottom is not None
     measured: dict[str, float] = {}
     # A survey may be larger than memory: a pass is let go once it is written, but for a mission, whose map
     # comes next.
@@ -90,39 +112,28 @@ def command(
     kept: list[PassSummary] = []
     contacts: list[Contact] = []
     bottoms: list[str] = []
-    with progress_bars(quiet) as progress:
-        survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
-        if not quiet:
-            for warning in survey.warnings:
-                click.echo(f"note: {warning}", err=True)
-
-        for index, result in strips_of(survey, config, progress):
-            strip = result.strip
-            write_strip(out / f"strip-{index:03d}.nc", strip, survey.utc)
-            plot_pass(out / f"strip-{index:03d}.png", result)
-            contacts = pictured([*contacts, *contacts_of(result)])
-            bottoms.extend(bottom_rows(strip.time_s, strip.ping, strip.pass_index, result.tracked,
-                                       survey.utc, given is not None))  # fmt: skip
-            _add_up(measured, result)
-            tables.append(result.objects)
-            if keep:
-                kept.append(PassSummary.of(result))
+    for index, result in strips_of(survey, config, progress):
+        strip = result.strip
+        write_strip(out / f"strip-{index:03d}.nc", strip, survey.utc)
+        plot_pass(out / f"strip-{index:03d}.png", result)
+        contacts = pictured([*contacts, *contacts_of(result)])
+        bottoms.extend(bottom_rows(strip.time_s, strip.ping, strip.pass_index, result.tracked,
+                                   survey.utc, given))  # fmt: skip
+        _add_up(measured, result)
+        tables.append(result.objects)
         if keep:
-            keep_passes(survey, config, tuple(kept))
+            kept.append(PassSummary.of(result))
+    if keep:
+        keep_passes(survey, config, tuple(kept))
     objects = ObjectTable.joined(tables)
     write_objects_csv(out / "objects.csv", objects)
     write_bottom_csv(out / "bottom.csv", bottoms)
-    title = ", ".join(path.name for path in surveys[:3]) + (" ..." if len(surveys) > 3 else "")
     write_contacts(out / "contacts.html", contacts, title, survey.crs)
-    metrics = _metrics(measured, objects, len(tables), time.perf_counter() - began)
-    write_metrics(
-        out, metrics,
-        {"surveys": [str(p) for p in surveys], "crs": survey.crs, "cell_m": cell,
-              "bottom": bottom},
-    )  # fmt: skip
-    if not quiet:
-        print_table("strips", [(name, _shown(value)) for name, value in metrics.items()])
-        click.echo(f"written to {out}")
+    return _metrics(measured, objects, len(tables), time.perf_counter() - began)
+
+
+def _title(surveys: tuple[Path, ...]) -> str:
+    return ", ".join(path.name for path in surveys[:3]) + (" ..." if len(surveys) > 3 else "")
 
 
 def _clear(out: Path) -> None:
