@@ -15,7 +15,8 @@ class Estimate:
     """Where the vehicle is, by all measurements up to this one.
 
     `covariance_m2` (2, 2) is of easting and northing; `state` (5,) is offset east, offset north,
-    heading bias, scale, depth bias, and `state_covariance` theirs; `reason` tells what changed.
+    heading bias, scale, depth bias, and `state_covariance` theirs; `reason` tells what changed;
+    `afresh` that the state does not follow from the row before: another place was taken up.
     """
 
     time_s: float
@@ -27,3 +28,4 @@ class Estimate:
     state: FloatArray
     state_covariance: FloatArray
     reason: str = ""
+    afresh: bool = False

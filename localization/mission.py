@@ -22,8 +22,6 @@ from perception.records import BoolArray, FloatArray, IntArray, Progress, Trajec
 
 # A fix every five minutes: their errors share the map's and the biases, more would repeat them.
 _FIX_EVERY_S = 300.0
-# What the navigator says when it takes up a place that does not follow from the one before.
-_BEGAN_AGAIN = ("lost:", "jumped", "later soundings agree on another place")
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,16 +188,7 @@ def _fresh(nav: NavTable) -> BoolArray:
 
 def _pieces(rows: IntArray, estimates: Sequence[Estimate]) -> list[IntArray]:
     """Cut the rows where the filter began again: states before and after do not follow."""
-    cuts = [
-        i
-        for i in range(1, len(rows))
-        if estimates[rows[i]].reason and _breaks(estimates[rows[i]].reason)
-    ]
-    return np.split(rows, cuts)
-
-
-def _breaks(reason: str) -> bool:
-    return any(words in reason for words in _BEGAN_AGAIN)
+    return np.split(rows, [i for i in range(1, len(rows)) if estimates[rows[i]].afresh])
 
 
 def _smooth_piece(

@@ -116,6 +116,7 @@ class Navigator:
         self.since_update_m = 0.0
         self.heard_s = -math.inf
         self.seen_times: set[float] = set()
+        self.afresh = False
         self.search.start(*self.reckoning.state)
 
     # ---- one row -------------------------------------------------------------------------------
@@ -123,6 +124,7 @@ class Navigator:
     def update(self, measurement: Measurement) -> Estimate:
         """Take one row of navigation and give the position at it."""
         m = measurement
+        self.afresh = False
         if not math.isfinite(m.time_s):
             return self._estimate(m, "row without a time: not used")
         late = self.last is not None and m.time_s <= self.last.time_s
@@ -178,6 +180,7 @@ class Navigator:
             # Dead reckoning was reset: the vehicle went on, its offset changed by the jump.
             likely = self.velocity * seconds
             self._shift(likely - step)
+            self.afresh = True
             step, slip_m2 = likely, (_BLIND_M_S * seconds) ** 2
             reason = f"position jumped by {way:.0f} m in {seconds:.3g} s: taken as a reset"
         else:
@@ -297,6 +300,7 @@ class Navigator:
         self.proof.updates += 1
         if heard is Opinion.CONTRADICTS:
             self.proof.fail()
+            self.afresh = True
             self._begin_tracking(*self.search.moments())
             return "later soundings agree on another place; that is on probation now"
         confirmed = heard is Opinion.CONFIRMS and self.proof.holds
@@ -315,6 +319,7 @@ class Navigator:
     def _lose(self, reason: str) -> str:
         """Begin again from the last trusted state with a wider box and a free depth bias."""
         self.losses += 1
+        self.afresh = True
         self.proof.fail()
         self.reckoning.fall_back()
         self.tracking = False
@@ -351,6 +356,7 @@ class Navigator:
             state=state,
             state_covariance=joint,
             reason=reason,
+            afresh=self.afresh,
         )
 
     def _belief(self, m: Measurement) -> tuple[FloatArray, FloatArray, str]:

@@ -82,7 +82,10 @@ def _draw_map(
     axes.set_ylabel("northing (m)")
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.tick_params(axis="x", labelrotation=30)
-    axes.legend(loc="best", fontsize=8)
+    # Below the picture: anywhere inside it would lie over the track sooner or later.
+    axes.legend(
+        loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, facecolor="0.75"
+    )
     axes.set_title("Track on the prior map")
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
-
 import navsets
 import numpy as np
 import pytest
 
-from localization import navigator as navigator_module
 from localization.estimate import CONVERGED, LOST, Estimate
-from localization.mission import _BEGAN_AGAIN, Navigation, _pieces, navigate
+from localization.mission import Navigation, _pieces, navigate
 from localization.navfile import nav_table
 from localization.navigator import Navigator
 from localization.terrain import terrain_map
@@ -65,15 +62,23 @@ def test_smoothing_knows_the_start_that_the_causal_filter_could_not() -> None:
     assert start < 4.0 < 10.0 < errors(result, easting, northing)[0]
 
 
-@pytest.mark.parametrize("words", _BEGAN_AGAIN)
-def test_smoothing_does_not_reach_across_a_place_taken_up_anew(words: str) -> None:
-    assert words in inspect.getsource(navigator_module)
+def test_smoothing_does_not_reach_across_a_place_taken_up_anew() -> None:
+    def told(afresh: bool) -> Estimate:
+        return Estimate(
+            0.0, 0.0, 0.0, np.eye(2), CONVERGED, 1.0, np.zeros(5), np.eye(5), afresh=afresh
+        )
 
-    def told(reason: str) -> Estimate:
-        return Estimate(0.0, 0.0, 0.0, np.eye(2), CONVERGED, 1.0, np.zeros(5), np.eye(5), reason)
-
-    rows = [told(reason) for reason in ("", "", f"{words} 40 m", "", "no soundings")]
+    rows = [told(afresh) for afresh in (False, False, True, False, False)]
     assert [list(piece) for piece in _pieces(np.arange(5), rows)] == [[0, 1], [2, 3, 4]]
+
+
+def test_a_reset_and_a_loss_are_told_as_a_state_taken_up_afresh() -> None:
+    columns, _, _ = navsets.mission(np.random.default_rng(16))
+    middle = len(columns["time_s"]) // 2
+    columns["easting_m"][middle:] += 400.0
+    afresh = [e.afresh for e in run(columns).estimates]
+    assert afresh[middle]
+    assert not any(afresh[:middle])
 
 
 def test_featureless_ground_gives_no_fix_and_sigma_does_not_shrink() -> None:
