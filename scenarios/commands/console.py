@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,9 @@ from typing import Any
 import click
 
 from perception.records import InputError, Progress, silent
+
+# A log is told of a long step this often.
+_LINE_SECONDS = 15.0
 
 
 def common_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -73,9 +77,12 @@ def _remove_empty(folders: list[Path]) -> None:
 
 @contextmanager
 def progress_bars(quiet: bool = False) -> Iterator[Progress]:
-    """Yield a `Progress` that draws one bar per label on a terminal, and nothing in a pipe."""
-    if quiet or not sys.stderr.isatty():
+    """Yield a `Progress` that draws one bar per label on a terminal, and tells a pipe a line now and then."""
+    if quiet:
         yield silent
+        return
+    if not sys.stderr.isatty():
+        yield progress_lines()
         return
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -97,6 +104,30 @@ def progress_bars(quiet: bool = False) -> Iterator[Progress]:
             bars.update(tasks[label], completed=done, total=total)
 
         yield report
+
+
+def progress_lines(clock: Callable[[], float] = time.monotonic) -> Progress:
+    """Return a `Progress` for logs: no bar, one line on standard error at most every `_LINE_SECONDS`.
+
+    A command that is done before says nothing; one that takes minutes tells what it is at and what is left of it.
+    """
+    told = clock()
+    began: dict[str, tuple[float, int]] = {}
+
+    def report(label: str, done: int, total: int) -> None:
+        nonlocal told
+        now = clock()
+        start, first = began.setdefault(label, (now, done))
+        if now - told < _LINE_SECONDS or done >= total:
+            return
+        told = now
+        line = f"{label}: {done} of {total}"
+        if done > first:
+            left = (now - start) * (total - done) / (done - first)
+            line += f" after {now - start:.0f} s, about {left:.0f} s left"
+        click.echo(line, err=True)
+
+    return report
 
 
 def print_table(title: str, rows: list[tuple[str, str]]) -> None:

@@ -6,7 +6,7 @@ from click.testing import CliRunner
 from perception.records import InputError
 from scenarios.commands import scenarios as scenarios_command
 from scenarios.commands import sensors as sensors_command
-from scenarios.commands.console import out_option, prepare_out
+from scenarios.commands.console import out_option, prepare_out, progress_lines
 
 
 @click.command()
@@ -38,3 +38,18 @@ def test_a_folder_with_results_stays(tmp_path):
 def test_lists_take_the_common_options():
     for module in (scenarios_command, sensors_command):
         assert CliRunner().invoke(module.command, ["-q"]).exit_code == 0
+
+
+def test_a_pipe_is_told_of_long_steps_only_and_what_is_left_of_them(capsys):
+    seconds = iter([0.0, 1.0, 5.0, 20.0, 21.0, 40.0, 80.0])
+    report = progress_lines(lambda: next(seconds))
+    for done in range(5):
+        report("joint inversion", done, 4)
+    # One at 20 s, with half of the work done in 19 s; none so soon after, none at the end.
+    report("writing", 0, 2)
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.splitlines() == [
+        "joint inversion: 2 of 4 after 19 s, about 19 s left",
+        "writing: 0 of 2",
+    ]
