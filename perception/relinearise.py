@@ -35,9 +35,9 @@ _MOSTLY_ONE_SIDED = 0.85
 _ONE_SIDED_PART = 0.1
 
 
-# Steps about a surface without detail, that settle the mean profiles; 1-sigma of those afterwards.
-_SMOOTH_STEPS = 3
-_PROFILE_M = 0.2
+# Steps about a surface without detail, that settle the mean profiles; least 1-sigma of those afterwards.
+_SMOOTH_STEPS = 4
+_PROFILE_M = 0.02
 
 
 def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generator) -> Solved:
@@ -130,11 +130,14 @@ def _sounding_profiles(state: State, base: FloatArray, single: BoolArray) -> Equ
 def _first_profiles(state: State, first: FloatArray, lit: BoolArray) -> Equations:
     """Return the mean profiles across the tracks as the steps about a smooth floor found them.
 
-    About a smooth floor mean slope and mean log power are in proportion. Held loosely: detail seen from two sides
-    tells more of the profile, and where there is little, the hold keeps a step from running along what gain leaves free.
+    About a smooth floor mean slope and mean log power are in proportion. What that misses grows with the
+    roughness, and so does what detail seen from two sides tells of the profile: the hold's 1-sigma is the
+    lead of the first returns, which is roughness in metres. On a smooth floor the steps that follow would raise
+    domes of a decimetre that only the gain contradicts.
     """
     frame = (first, state.west_m, state.south_m, state.cell_m, state.rays)
-    return mean_profiles(*frame, lit, _PROFILE_M, relative=True)
+    sigma = max(float(np.mean(state.lead_m)), _PROFILE_M)
+    return mean_profiles(*frame, lit, sigma, relative=True)
 
 
 def _without_detail(state: State) -> FloatArray:
