@@ -20,7 +20,7 @@ from localization.navfile import NavTable, read_nav
 from localization.navigator import Navigator, NavigatorConfig
 from localization.terrain import TerrainMap, terrain_map
 from mapping.fixes import write_fixes
-from mapping.rasters import read_map
+from mapping.rasters import open_map, read_map
 from mapping.trajectories import write_trajectory
 from perception.geodesy import convergence, is_local
 from perception.records import Grid, InputError, NoOverlapError, Progress
@@ -28,6 +28,8 @@ from scenarios.locating_swath import nav_of_survey, open_side_scan, patch_fixes
 
 logger = logging.getLogger(__name__)
 
+# Of a map of more cells only the part that the vehicle can reach is read.
+_LARGE_CELLS = 4_000_000
 # Beams reach to the side, and biases carry the track away from dead reckoning.
 _MARGIN_M, _MARGIN_SIGMAS, _MARGIN_PART = 300.0, 6.0, 0.03
 
@@ -58,18 +60,19 @@ def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, A
     from scenarios.plots_navigation import draw_navigation
 
     began = time.perf_counter()
-    prior, sigma_source = prior_with_sigma(options.prior, options.map_sigma_m)
+    crs = crs_of(options.prior)
     sensors = None if options.sensors is None else read_sensors(options.sensors)
-    survey = open_side_scan(options.swath, prior.crs, progress) if options.swath else None
+    survey = open_side_scan(options.swath, crs, progress) if options.swath else None
     # Files have headings from true north; inside they are from grid north.
     told = None
     if options.nav is not None:
         read = read_nav(options.nav, sensors)
-        nav, told = on_grid(read, prior.crs), read.heading_rad
+        nav, told = on_grid(read, crs), read.heading_rad
     elif survey is not None:
         nav = nav_of_survey(survey, sensors or Sensors())
     else:
         raise InputError("locate needs --nav NAV.csv, --swath SURVEY, or both")
+    prior, sigma_source = prior_with_sigma(options.prior, options.map_sigma_m, reach(nav))
     try:
         terrain = terrain_map(prior, options.map_error_length_m, reach(nav))
     except NoOverlapError as error:
@@ -113,9 +116,24 @@ def on_grid(nav: NavTable, crs: str) -> NavTable:
     )
 
 
-def prior_with_sigma(path: Path, sigma_m: float | None) -> tuple[Grid, str]:
-    """Read a prior map and make sure that it has a sigma; tell where the sigma is from."""
-    grid = read_map(path, sigma_m)
+def crs_of(path: Path) -> str:
+    """Name of a map's CRS, without reading the map."""
+    with open_map(path) as opened:
+        return opened.read(slice(0, 1), slice(0, 1)).crs
+
+
+def prior_with_sigma(
+    path: Path, sigma_m: float | None, bounds: tuple[float, float, float, float] | None = None
+) -> tuple[Grid, str]:
+    """Read a prior map and make sure that it has a sigma; tell where the sigma is from.
+
+    Parameters
+    ----------
+    bounds : west, south, east, north of what is needed: of a large map no more is read.
+    """
+    grid = _part_of(path, sigma_m, bounds) if bounds else None
+    if grid is None:
+        grid = read_map(path, sigma_m)
     if sigma_m is not None:
         return grid, "--map-sigma"
     if grid.sigma_m is not None and np.isfinite(grid.sigma_m).any():
@@ -128,6 +146,29 @@ def prior_with_sigma(path: Path, sigma_m: float | None) -> tuple[Grid, str]:
     )  # fmt: skip
     sigma = np.where(np.isfinite(grid.elevation_m), assumed, np.nan)
     return replace(grid, sigma_m=sigma), "assumed: IHO S-44 Order 1a"
+
+
+def _part_of(
+    path: Path, sigma_m: float | None, bounds: tuple[float, float, float, float]
+) -> Grid | None:
+    """Read the part of a large map within bounds; None of a small one, or where nothing is met."""
+    with open_map(path, sigma_m) as opened:
+        rows, cols = opened.shape
+        if rows * cols <= _LARGE_CELLS:
+            return None
+        corner = opened.read(slice(0, 1), slice(0, 1))
+        west, south, east, north = bounds
+        first, last = corner.fractional_index(np.array([west, east]), np.array([north, south]))
+        row, col = np.clip(np.floor(first), 0, rows), np.clip(np.floor(last), 0, cols)
+        # A few cells more: the edge of the data is none of the ground.
+        window = (
+            slice(max(int(row[0]) - 8, 0), min(int(row[1]) + 9, rows)),
+            slice(max(int(col[0]) - 8, 0), min(int(col[1]) + 9, cols)),
+        )
+        if min(w.stop - w.start for w in window) < 2:
+            return None
+        grid = opened.read(*window)
+    return grid if np.isfinite(grid.elevation_m).any() else None
 
 
 def reach(nav: NavTable) -> tuple[float, float, float, float]:

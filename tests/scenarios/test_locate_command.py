@@ -11,8 +11,9 @@ import pytest
 from click.testing import CliRunner, Result
 from scipy import ndimage
 
-from mapping.rasters import write_map
+from mapping.rasters import OpenMap, write_map
 from perception.records import Grid, InputError, NoOverlapError
+from scenarios import locating
 from scenarios.benchmarks.navigation_sets import NavigationSet, SetConfig, make_set
 from scenarios.commands.locate import command, in_words
 
@@ -66,6 +67,37 @@ def test_a_map_elsewhere_fails_with_both_extents(files: Path, tmp_path: Path) ->
     assert isinstance(result.exception, NoOverlapError)
     assert "does not meet the prior map" in str(result.exception)
     assert not (tmp_path / "out" / "trajectory.csv").exists()
+
+
+def test_of_a_large_map_only_the_part_in_reach_is_read_and_the_track_is_the_same(
+    drawn: NavigationSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A map of 6 km, of which the mission reaches a third."""
+    wide = np.pad(drawn.prior.elevation_m, 400, mode="reflect")
+    prior = Grid(
+        wide, drawn.prior.west_m - 2000.0, drawn.prior.north_m + 2000.0, 5.0, drawn.prior.crs,
+        np.full(wide.shape, 0.3),
+    )  # fmt: skip
+    write_map(tmp_path / "prior.tif", prior)
+    pd.DataFrame(drawn.nav).head(40).to_csv(tmp_path / "nav.csv", index=False)
+    texts, sizes = [], []
+    reading = OpenMap.read
+
+    def counted(opened: OpenMap, *window: slice) -> Grid:
+        grid = reading(opened, *window)
+        sizes.append(grid.elevation_m.size)
+        return grid
+
+    monkeypatch.setattr(OpenMap, "read", counted)
+    for name, limit in (("whole", 10_000_000), ("part", 100_000)):
+        monkeypatch.setattr(locating, "_LARGE_CELLS", limit)
+        result = locate(
+            "--map", tmp_path / "prior.tif", "--nav", tmp_path / "nav.csv", "--out", tmp_path / name
+        )
+        assert result.exit_code == 0, result.output
+        texts.append((tmp_path / name / "trajectory.csv").read_text())
+    assert texts[0] == texts[1]
+    assert sizes[-1] < 0.7 * wide.size < max(sizes)
 
 
 def test_a_map_without_sigma_is_used_with_one_that_is_told(files: Path, tmp_path: Path) -> None:
