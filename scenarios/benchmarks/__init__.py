@@ -21,6 +21,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     ),
     "experiments": ("experiments", "the experiment runner: overhead, memory, sameness"),
     "sonar-files": ("sonar_files", "reading sonar files: pings a second, memory at 1x and 10x"),
+    "strips-memory": (
+        "strips_memory",
+        "bathynav strips: memory and time on a file of 1x, of 10x, and on one line of 10x",
+    ),
     "echoes": ("echoes", "echoes to strips: pings a minute, heights of objects against truth"),
     "mapping": ("mapping", "one map from many passes: registration, pose graph, gridding, peers"),
     "mapping-large": (
@@ -36,6 +40,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
         "Patches placed on a map, heading known or not: compact map beside correlation.",
     ),
     "navigation-montecarlo": ("navigation_montecarlo", "False fixes over terrains, drawn errors."),
+    "navigation-observability": (
+        "navigation_observability",
+        "Where terrain can fix a vehicle: foretold error beside runs on the same ground.",
+    ),
     "navigation": (
         "navigation",
         "Position from terrain: error, bound, honesty, time per update, peers.",
