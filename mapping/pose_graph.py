@@ -14,7 +14,7 @@ from typing import Any
 
 import gtsam as typed_gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, E, G, H
+from gtsam.symbol_shorthand import B, E, G, H, M
 
 from mapping.keyframes import KeyframeFix, Keyframes
 from perception.records import BoolArray, FloatArray
@@ -59,15 +59,31 @@ class GraphConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class Blend:
+    """Two keyframes of one pass and the weight of the second: what stands between them is their mean."""
+
+    low: int
+    high: int
+    share: float
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """Return the weighted mean of per-keyframe values."""
+        mean: FloatArray = (1.0 - self.share) * values[self.low] + self.share * values[self.high]
+        return mean
+
+
+@dataclass(frozen=True, slots=True)
 class Link:
     """A registration between two keyframes: the ground each saw, brought together.
 
     Attributes
     ----------
-    first, second : keyframes.
-    first_offset_m, second_offset_m : (2,) from each keyframe to the matched ground.
+    first, second : keyframes nearest to where each pass saw the ground.
+    first_offset_m, second_offset_m : (2,) from each keyframe, or blend of two, to the matched ground.
     shift_m : (2,) correction of the ground of `second` minus that of `first`.
     covariance_m2 : (2, 2) of `shift_m`.
+    first_blend, second_blend : where two keyframes tell better what the pass's correction was on average while it saw
+        the ground; None the keyframe alone.
     """
 
     first: int
@@ -76,6 +92,8 @@ class Link:
     second_offset_m: FloatArray
     shift_m: FloatArray
     covariance_m2: FloatArray
+    first_blend: Blend | None = None
+    second_blend: Blend | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,20 +356,44 @@ def add_odometry(
 def add_link(graph: Any, values: Any, keyframes: Keyframes, link: Link, number: int) -> int:
     """Add the two patches of ground and the registration between them; return its factor's index."""
     tie = gtsam.noiseModel.Isotropic.Sigma(2, _TIE_M)
-    ends = ((link.first, link.first_offset_m), (link.second, link.second_offset_m))
-    for side, (k, offset) in enumerate(ends):
+    ends = (
+        (link.first, link.first_blend, link.first_offset_m),
+        (link.second, link.second_blend, link.second_offset_m),
+    )
+    for side, (k, blend, offset) in enumerate(ends):
         ground = G(2 * number + side)
         values.insert(ground, np.zeros(2))
+        correction = _mean_correction(graph, values, blend, 2 * number + side) or E(k)
         # A wrong heading of the sonar swings the ground about the vehicle.
         swing = np.column_stack([np.zeros((2, 2)), perpendicular(offset)])
         graph.add(
             _linear(
-                (E(k), -np.eye(2)), (ground, np.eye(2)), (B(int(keyframes.strip[k])), -swing), tie
+                (correction, -np.eye(2)),
+                (ground, np.eye(2)),
+                (B(int(keyframes.strip[k])), -swing),
+                tie,
             )
         )
     noise = gtsam.noiseModel.Gaussian.Covariance(link.covariance_m2)
     graph.add(gtsam.BetweenFactorVector(G(2 * number), G(2 * number + 1), link.shift_m, noise))
     return int(graph.size()) - 1
+
+
+def _mean_correction(graph: Any, values: Any, blend: Blend | None, number: int) -> int | None:
+    """Add the weighted mean of two corrections as a variable and return its key; None where one tells all."""
+    if blend is None or blend.low == blend.high:
+        return None
+    mean = M(number)
+    values.insert(mean, np.zeros(2))
+    graph.add(
+        _linear(
+            (E(blend.low), (blend.share - 1.0) * np.eye(2)),
+            (E(blend.high), -blend.share * np.eye(2)),
+            (mean, np.eye(2)),
+            gtsam.noiseModel.Isotropic.Sigma(2, _TIE_M),
+        )
+    )
+    return int(mean)
 
 
 def _linear(*terms: Any) -> Any:

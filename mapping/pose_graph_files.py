@@ -7,6 +7,7 @@ relation is written between keyframes: a fair copy of the graph about its soluti
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ import numpy as np
 
 from mapping.graph_files import PoseGraph, write_g2o
 from mapping.keyframes import Keyframes
-from mapping.pose_graph import Solution, build, gauss_newton, perpendicular
+from mapping.pose_graph import Blend, Solution, build, gauss_newton, perpendicular
 from mapping.survey import CorrectedSurvey
-from perception.files import existing_file, write_text
-from perception.records import FloatArray, InputError
+from perception.files import write_text
+from perception.records import FloatArray
 
 gtsam: Any = typed_gtsam
 
@@ -42,24 +43,6 @@ def write_graph(folder: Path, corrected: CorrectedSurvey) -> None:
     values = gtsam.GaussNewtonOptimizer(graph, start, gauss_newton()).optimize()
     write_text(folder / "graph-factors.txt", graph.serialize())
     write_text(folder / "graph-values.txt", values.serialize())
-
-
-def read_graph(folder: Path) -> tuple[Any, Any]:
-    """Read the factors and values that `write_graph` wrote, as GTSAM objects.
-
-    Raises
-    ------
-    InputError
-        A file is missing, or is not GTSAM's serialisation.
-    """
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for name, target in (("graph-factors.txt", graph), ("graph-values.txt", values)):
-        path = existing_file(folder / name)
-        try:
-            target.deserialize(path.read_text(encoding="utf-8"))
-        except (RuntimeError, ValueError) as error:
-            raise InputError(f"{path}: is not GTSAM's serialisation ({error})") from error
-    return graph, values
 
 
 def survey_poses(corrected: CorrectedSurvey) -> PoseGraph:
@@ -142,22 +125,39 @@ def _odometry(keyframes: Keyframes, solution: Solution, place: FloatArray) -> li
 
 
 def _registrations(corrected: CorrectedSurvey, place: FloatArray) -> list[Relation]:
+    """Return each registration between keyframes, with the misfit that it has in the solution.
+
+    One that holds the mean of two keyframes becomes a relation of each pair, by the product of their shares: all with
+    the one misfit, so that they pull as it did and the optimum stays where it is.
+    """
     relations: list[Relation] = []
-    strip, errors = corrected.keyframes.strip, corrected.solution.pass_errors
-    for link, used in zip(corrected.links, corrected.solution.link_used, strict=True):
+    keyframes, solution = corrected.keyframes, corrected.solution
+    moved = place + solution.correction_m
+    for link, used in zip(corrected.links, solution.link_used, strict=True):
         if not used:
             continue
-        swing = [
-            errors[strip[k], 2] * perpendicular(offset)
-            for k, offset in (
-                (link.first, link.first_offset_m),
-                (link.second, link.second_offset_m),
-            )
+        ends = (
+            link.first_blend or Blend(link.first, link.first, 0.0),
+            link.second_blend or Blend(link.second, link.second, 0.0),
+        )
+        ground = [
+            blend.of(solution.correction_m)
+            + solution.pass_errors[keyframes.strip[blend.low], 2] * perpendicular(offset)
+            for blend, offset in zip(ends, (link.first_offset_m, link.second_offset_m), strict=True)
         ]
-        # The link is between pieces of ground; the vehicles stand off by the swing of each.
-        step = place[link.second] - place[link.first] + link.shift_m + swing[0] - swing[1]
-        relations.append((link.first, link.second, step, link.covariance_m2))
+        misfit = ground[1] - ground[0] - link.shift_m
+        for (i, part_i), (j, part_j) in product(*(_parts(blend) for blend in ends)):
+            step = moved[j] - moved[i] - misfit
+            relations.append((i, j, step, link.covariance_m2 / (part_i * part_j)))
     return relations
+
+
+def _parts(blend: Blend) -> list[tuple[int, float]]:
+    """Return the keyframes of a blend that have a share, and the shares."""
+    if blend.low == blend.high:
+        return [(blend.low, 1.0)]
+    both = ((blend.low, 1.0 - blend.share), (blend.high, blend.share))
+    return [(k, part) for k, part in both if part > 1e-6]
 
 
 def _rotation(angle: float) -> FloatArray:

@@ -13,10 +13,11 @@ from mapping.fusion import default_cell as default_fusion_cell
 from mapping.fusion import fuse
 from mapping.keyframes import Keyframes
 from mapping.link_choice import believed
+from mapping.links import link_of
 from mapping.overlaps import Window
 from mapping.placed import extent
 from mapping.placed import placed as strip_placed
-from mapping.pose_graph import GraphConfig, Link, Solution, perpendicular
+from mapping.pose_graph import GraphConfig, Link, Solution
 from mapping.registration import Match, match
 from mapping.textures import MatchConfig, Texture, placed_anew, texture
 from perception.records import ElevationStrip, FloatArray, Grid, Progress
@@ -79,12 +80,12 @@ def register(
         made = pool.map(lambda index: textures.placed(index, corrected[index], known), needed)
         placed = dict(zip(needed, made, strict=True))
 
-    def compare(window: Window) -> tuple[tuple[int, int], Match]:
+    def compare(window: Window) -> Match:
         first = keyframes.nearest(window.first, window.first_line)
         second = keyframes.nearest(window.second, window.second_line)
         prior = expected_shift(keyframes, solution, first, second, graph)
         search_m = 3.0 * float(np.sqrt(np.linalg.eigvalsh(prior).max())) + 2.0 * cell_m
-        return (first, second), match(
+        return match(
             placed[window.first],
             placed[window.second],
             (window.easting_m, window.northing_m),
@@ -96,17 +97,15 @@ def register(
         )
 
     results: list[tuple[Window, Match]] = []
-    ends: list[tuple[int, int]] = []
     # Transforms and gridding let go of the interpreter's lock; the order of results is that of the windows.
     with ThreadPoolExecutor(_THREADS) as pool:
-        for window, (pair, result) in zip(windows, pool.map(compare, windows), strict=True):
+        for window, result in zip(windows, pool.map(compare, windows), strict=True):
             results.append((window, result))
-            ends.append(pair)
             progress(label, len(results), len(windows))
     results = [(w, m) for (w, _), m in zip(results, believed([m for _, m in results]), strict=True)]
     links = [
-        _link(corrected, keyframes, solution, window, result, pair, graph, floor)
-        for (window, result), pair in zip(results, ends, strict=True)
+        link_of(corrected, keyframes, solution, window, result, graph, floor)
+        for window, result in results
         if result.accepted
     ]
     return results, links
@@ -173,84 +172,3 @@ def expected_shift(
             both = between
     floor = np.eye(2) * 0.25
     return np.where(np.isfinite(both), both, 1e4 * np.eye(2)) + floor
-
-
-def _link(
-    strips: Sequence[ElevationStrip],
-    keyframes: Keyframes,
-    solution: Solution,
-    window: Window,
-    result: Match,
-    ends: Sequence[int],
-    config: GraphConfig,
-    floor: Grid | None,
-) -> Link:
-    """Turn a match of corrected strips into a constraint on corrections of the navigation."""
-    centre = np.array([window.easting_m, window.northing_m])
-    unknown_m = None if floor is None else _typical_sigma(floor, window)
-    offsets, ground = [], []
-    # The mean of a random walk over the window against its value in the middle: q^2 L / 12, each pass.
-    bend = 2.0 * config.drift_m_per_sqrt_km**2 / 1000.0 * window.side_m / 12.0
-    covariance = result.covariance_m2 + (bend + _LEFT_OVER_M**2) * np.eye(2)
-    for k in ends:
-        strip = int(keyframes.strip[k])
-        position = np.array([keyframes.easting_m[k], keyframes.northing_m[k]])
-        offset = centre - position - solution.correction_m[k]
-        offsets.append(offset)
-        swing = solution.pass_errors[strip, 2] * perpendicular(offset)
-        ground.append(solution.correction_m[k] + swing)
-        covariance = covariance + _misplacement(strips[strip], keyframes, k, offset, unknown_m)
-    return Link(
-        first=ends[0],
-        second=ends[1],
-        first_offset_m=offsets[0],
-        second_offset_m=offsets[1],
-        shift_m=ground[1] - ground[0] - result.shift_m,
-        covariance_m2=covariance,
-    )
-
-
-# The part of the floor's unevenness along a track that stays unknown beside it.
-_UNKNOWN_RELIEF = 0.6
-# What the width of beams and unmeasured rocking leave of any registration, 1-sigma an axis.
-_LEFT_OVER_M = 0.2
-
-
-def _typical_sigma(floor: Grid, window: Window) -> float | None:
-    """Return the mean sigma (m) of a floor over a window; None where it has none there."""
-    if floor.sigma_m is None:
-        return None
-    half = 0.5 * window.side_m
-    row, col = floor.fractional_index(
-        np.array([window.easting_m - half, window.easting_m + half]),
-        np.array([window.northing_m + half, window.northing_m - half]),
-    )
-    rows = slice(max(int(row[0]), 0), max(int(row[1]) + 1, 0))
-    cols = slice(max(int(col[0]), 0), max(int(col[1]) + 1, 0))
-    sigma = floor.sigma_m[rows, cols]
-    known = sigma[np.isfinite(sigma)]
-    return float(known.mean()) if known.size else None
-
-
-def _misplacement(
-    strip: ElevationStrip,
-    keyframes: Keyframes,
-    keyframe: int,
-    offset_m: FloatArray,
-    unknown_m: float | None,
-) -> FloatArray:
-    """Return the (2, 2) covariance by which unknown relief misplaces a square of ground.
-
-    Ground that lies h above the floor beneath the track is drawn h a / x towards it (`placed_across`). What
-    is unknown of h is told by the floor map's sigma, or else by how uneven the floor is along the track.
-    """
-    heading = float(keyframes.heading_rad[keyframe])
-    starboard = np.array([np.cos(heading), -np.sin(heading)])
-    line = int(keyframes.line[keyframe])
-    altitude = float(np.nan_to_num(strip.altitude_m[line]))
-    beneath = -(strip.depth_m + strip.altitude_m)
-    unevenness = float(np.nanstd(beneath)) if np.isfinite(beneath).any() else 0.1 * altitude
-    away = max(abs(float(offset_m @ starboard)), altitude, 1e-6)
-    unknown_m = _UNKNOWN_RELIEF * unevenness if unknown_m is None else unknown_m
-    sigma = unknown_m * altitude / away
-    return sigma**2 * np.outer(starboard, starboard)

@@ -45,6 +45,7 @@ from perception.objects import ObjectTable, write_objects_csv
 from perception.readers import Survey
 from perception.records import ElevationStrip, Grid, Progress, Trajectory, silent
 from scenarios.plots_survey import plot_layer, plot_map
+from scenarios.report.contacts import moved, write_contacts
 from scenarios.survey_map import SurveyMap
 from scenarios.survey_tiles import TiledSurvey
 
@@ -205,6 +206,14 @@ def _write_shared(
     if tie is not None:
         write_changes(changes, tie.left)
     objects = _write_objects(out, result.objects, pings, result.track, survey.crs)
+    looks = [
+        look
+        for contacts, table in zip(result.contacts, result.objects, strict=True)
+        for look in moved(contacts, table)
+    ]
+    names = [file.path.name for file in survey.files]
+    title = ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
+    write_contacts(out / "contacts.html", looks, title, survey.crs)
     return _survey_metrics(survey, result.corrected) | objects
 
 

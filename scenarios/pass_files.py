@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,12 @@ from perception.records import ElevationStrip, FloatArray, Progress, silent
 from perception.strip_files import read_strip, write_strip
 from perception.strips import PassResult, StripConfig, build_strip
 from scenarios.passes import each_pass
+from scenarios.report.contacts import Contact, contacts_of, pictured
 
 # Registration compares strips on this part of its cell; finer columns stay on disk.
 _THIN = 0.6
+# As in `scenarios.survey_map`.
+_PICTURES_A_PASS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +50,7 @@ class FiledPass:
     reach_m: FloatArray
     objects: ObjectTable
     cell_m: float
+    contacts: tuple[Contact, ...] = ()
 
 
 def file_passes(
@@ -89,10 +93,11 @@ def _written(result: PassResult, path: Path, key: str, utc: bool) -> FiledPass:
     """Write a pass; its mark comes last, so that what a killed run left half done is made anew."""
     path.with_suffix(".json").unlink(missing_ok=True)  # an older key's, whose files are overwritten
     write_strip(path, result.strip, utc)
-    _write_objects(path.with_suffix(".objects.npz"), result.objects)
+    contacts = tuple(pictured(contacts_of(result), _PICTURES_A_PASS))
+    _write_objects(path.with_suffix(".objects.npz"), result.objects, contacts)
     file = StripFile.of(path)
     write_text(path.with_suffix(".json"), json.dumps({"key": key, "digest": file.digest}) + "\n")
-    return _filed(file, result.strip, result.objects)
+    return _filed(file, result.strip, result.objects, contacts)
 
 
 def _taken_up(path: Path, key: str) -> FiledPass | None:
@@ -101,29 +106,47 @@ def _taken_up(path: Path, key: str) -> FiledPass | None:
         said = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
         if said["key"] != key or StripFile.of(path).digest != said["digest"]:
             return None
-        objects = _read_objects(path.with_suffix(".objects.npz"))
+        objects, contacts = _read_objects(path.with_suffix(".objects.npz"))
     except (OSError, ValueError, KeyError):
         return None
-    return _filed(StripFile(path, said["digest"]), read_strip(path), objects)
+    return _filed(StripFile(path, said["digest"]), read_strip(path), objects, contacts)
 
 
-def _filed(file: StripFile, strip: ElevationStrip, objects: ObjectTable) -> FiledPass:
+def _filed(
+    file: StripFile, strip: ElevationStrip, objects: ObjectTable, contacts: tuple[Contact, ...]
+) -> FiledPass:
     cell_m = default_cell([strip])
     across_m = np.asarray(strip.across_m, float)
     return FiledPass(
-        file, thinned(strip, _THIN * cell_m), across_m, reach_of(strip), objects, cell_m
+        file, thinned(strip, _THIN * cell_m), across_m, reach_of(strip), objects, cell_m, contacts
     )
 
 
-def _write_objects(path: Path, table: ObjectTable) -> None:
+def _write_objects(path: Path, table: ObjectTable, contacts: tuple[Contact, ...]) -> None:
+    """Write a pass's objects, and the echoes that show them one behind the other."""
     columns: dict[str, Any] = {f.name: np.asarray(getattr(table, f.name)) for f in fields(table)}
     columns["kind"] = np.array(table.kind, dtype="U16")
+    said = [{k: v for k, v in asdict(c).items() if k != "snippet"} for c in contacts]
+    columns["contacts"] = np.array(json.dumps(said))
+    columns["snippets"] = np.frombuffer(b"".join(c.snippet for c in contacts), np.uint8)
+    columns["snippet_ends"] = np.cumsum([len(c.snippet) for c in contacts], dtype=np.int64)
     with whole_file(path) as temporary:
         np.savez(temporary, **columns)
 
 
-def _read_objects(path: Path) -> ObjectTable:
+def _read_objects(path: Path) -> tuple[ObjectTable, tuple[Contact, ...]]:
     with np.load(path, allow_pickle=False) as data:
         columns: dict[str, Any] = {f.name: data[f.name] for f in fields(ObjectTable)}
+        said = json.loads(str(data["contacts"]))
+        ends, echoes = data["snippet_ends"].tolist(), data["snippets"].tobytes()
     columns["kind"] = tuple(str(kind) for kind in columns["kind"])
-    return ObjectTable(**columns)
+    contacts = tuple(
+        Contact(**{k: _hashable(v) for k, v in one.items()}, snippet=echoes[first:last])
+        for one, first, last in zip(said, [0, *ends], ends, strict=False)
+    )
+    return ObjectTable(**columns), contacts
+
+
+def _hashable(value: Any) -> Any:
+    """Return a value as it was before JSON made lists of its tuples."""
+    return tuple(_hashable(v) for v in value) if isinstance(value, list) else value

@@ -37,9 +37,14 @@ from perception.records import (
 from perception.strips import PassResult, StripConfig, common_samples, known_depth
 from scenarios.map_loop import check_prior, refine_on_map, tied_to_prior
 from scenarios.passes import strips_of
+from scenarios.report.contacts import Contact, contacts_of, pictured
 
 if TYPE_CHECKING:
     from perception.inversion import InversionResult, Look
+
+
+# The likeliest objects of a pass that `contacts.html` may show: a picture takes some 10 kB.
+_PICTURES_A_PASS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +57,7 @@ class PassSummary:
     shadow : (port, starboard) shadow masks (n, m), eight samples a byte: they are needed whole only
         while their own pass is inverted.
     n_samples : columns of the masks.
+    contacts : what `contacts.html` shows of the objects, as navigated.
     """
 
     strip: ElevationStrip
@@ -60,14 +66,16 @@ class PassSummary:
     bottom: BottomTrack
     shadow: tuple[np.ndarray, np.ndarray]
     n_samples: int
+    contacts: tuple[Contact, ...] = ()
 
     @classmethod
     def of(cls, result: PassResult) -> PassSummary:
         port, starboard = (np.packbits(side == SHADOW, axis=1) for side in result.levels)
         width = result.levels[0].shape[1]
         return cls(
-            result.strip, result.floor, result.objects, result.bottom, (port, starboard), width
-        )
+            result.strip, result.floor, result.objects, result.bottom, (port, starboard), width,
+            tuple(pictured(contacts_of(result), _PICTURES_A_PASS)),
+        )  # fmt: skip
 
     def masks(self) -> tuple[BoolArray, BoolArray]:
         """Return the shadow masks (n, m) of port and starboard."""
@@ -99,6 +107,11 @@ class SurveyMap:
     corrected: CorrectedSurvey
     objects: tuple[ObjectTable, ...]
     inversion: InversionResult | None
+
+    @property
+    def contacts(self) -> tuple[tuple[Contact, ...], ...]:
+        """Every pass's contacts, as navigated."""
+        return tuple(one.contacts for one in self.passes)
 
 
 def map_survey(

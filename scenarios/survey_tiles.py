@@ -33,6 +33,7 @@ from perception.records import ElevationStrip, Grid, Progress, Trajectory, silen
 from scenarios.cluster import open_cluster
 from scenarios.map_loop import check_prior
 from scenarios.pass_files import FiledPass, file_passes
+from scenarios.report.contacts import Contact
 from scenarios.survey_map import corrected_objects, identity, navigated_track, whole_track
 
 # A map of more cells than this is made in tiles without being asked: in one piece it would take some
@@ -53,7 +54,7 @@ class TiledSurvey:
     ----------
     plan, store : the tiles; `figures` of the whole map, `made` tiles that this run made.
     filled : cells whose gaps were filled; None where that was not asked for.
-    track, raw_track, corrected, objects : as in `SurveyMap`; the strips of `corrected` are coarse.
+    track, raw_track, corrected, objects, contacts : as in `SurveyMap`; the strips of `corrected` are coarse.
     """
 
     plan: TilePlan
@@ -64,6 +65,7 @@ class TiledSurvey:
     raw_track: Trajectory
     corrected: CorrectedSurvey
     objects: tuple[ObjectTable, ...]
+    contacts: tuple[tuple[Contact, ...], ...] = ()
     filled: int | None = None
 
     @property
@@ -158,6 +160,7 @@ def map_tiles(
         raw_track=raw,
         corrected=corrected,
         objects=tuple(corrected_objects(one.objects, raw, track) for one in passes),
+        contacts=tuple(one.contacts for one in passes),
         filled=filled,
     )
 

@@ -163,7 +163,7 @@ def _bare_gtsam(factors: Any, start: Any) -> None:
     marginals = gtsam.Marginals(factors, result)
     keys = result.keys()
     for key in keys:
-        if gtsam.Symbol(key).chr() != ord("g"):
+        if chr(gtsam.Symbol(key).chr()) not in "gm":
             marginals.marginalCovariance(key)
 
 

@@ -111,14 +111,29 @@ def _parts(table: ObjectTable, rows: Sequence[int]) -> tuple[str, ...]:
     )
 
 
-def pictured(contacts: Sequence[Contact]) -> list[Contact]:
-    """Return the contacts with pictures of the likeliest only, once twice as many as the page shows have one."""
-    if sum(bool(contact.snippet) for contact in contacts) <= 2 * _MOST:
+def pictured(contacts: Sequence[Contact], most: int = _MOST) -> list[Contact]:
+    """Return the contacts with pictures of the likeliest `most` only, once twice as many have one."""
+    if sum(bool(contact.snippet) for contact in contacts) <= 2 * most:
         return list(contacts)
     ranked = sorted(range(len(contacts)), key=lambda i: -contacts[i].probability)
-    unseen = set(ranked[_MOST:])
+    unseen = set(ranked[most:])
     return [
         replace(c, snippet=b"") if i in unseen and c.snippet else c for i, c in enumerate(contacts)
+    ]
+
+
+def moved(contacts: Sequence[Contact], table: ObjectTable) -> list[Contact]:
+    """Return a pass's contacts where its objects lie in `table`, the same objects on a corrected track."""
+    rows = {
+        (int(ping), float(range_m), kind): k
+        for k, (ping, range_m, kind) in enumerate(
+            zip(table.ping, table.slant_range_m, table.kind, strict=True)
+        )
+    }
+    at = [rows[c.ping, c.slant_range_m, c.kind] for c in contacts]
+    return [
+        replace(c, easting_m=float(table.easting_m[k]), northing_m=float(table.northing_m[k]))
+        for c, k in zip(contacts, at, strict=True)
     ]
 
 

@@ -17,6 +17,7 @@ from mapping.tile_figures import map_figures
 from mapping.tile_plan import StripFile, TilePlan, filed, load_plan, plan_tiles, save_plan
 from mapping.tile_run import fuse_tiles
 from mapping.tile_store import TileStore
+from mapping.tiles import LAYERS
 from perception.records import ElevationStrip, InputError, Trajectory
 from perception.strip_files import write_strip
 from tests.mapping.worlds import CRS, ORIGIN, fractal
@@ -120,7 +121,7 @@ def test_any_number_of_workers_gives_the_same_bits(tmp_path: Path) -> None:
     strips, track = a_survey(np.random.default_rng(2))
     plan = a_plan(tmp_path, strips, track, 1.0, 50)
     store, figures, _ = fuse_tiles(plan, tmp_path / "alone")
-    expected = {name: whole(store, name, plan) for name in ("elevation", "sigma", "count", "echo")}
+    expected = {name: whole(store, name, plan) for name in LAYERS}
     for workers in (1, 2):
         with (
             LocalCluster(
@@ -133,6 +134,34 @@ def test_any_number_of_workers_gives_the_same_bits(tmp_path: Path) -> None:
         assert new == len(plan.tiles()) and theirs == figures
         for name, values in expected.items():
             np.testing.assert_array_equal(whole(store, name, plan), values)
+
+
+def test_a_worker_that_is_killed_is_replaced_and_its_tiles_are_made_all_the_same(
+    tmp_path: Path,
+) -> None:
+    import os
+    import signal
+
+    from scenarios.cluster import open_cluster
+
+    strips, track = a_survey(np.random.default_rng(2))
+    plan = a_plan(tmp_path, strips, track, 1.0, 30)
+    store, figures, _ = fuse_tiles(plan, tmp_path / "alone")
+    expected = whole(store, "elevation", plan)
+    killed: list[int] = []
+
+    def kill_one(label: str, done: int, total: int) -> None:
+        """Kill a worker outright once it has made its first tiles."""
+        if done >= 2 and not killed:
+            killed.extend(client.run(os.getpid).values())
+            os.kill(killed[0], signal.SIGKILL)
+
+    with open_cluster(n_workers=2) as client:
+        store, theirs, new = fuse_tiles(plan, tmp_path / "struck", client, kill_one)
+        after = set(client.run(os.getpid).values())
+    assert killed and killed[0] not in after
+    assert new == len(plan.tiles()) > 4 and theirs == figures
+    np.testing.assert_array_equal(whole(store, "elevation", plan), expected)
 
 
 def test_a_killed_run_goes_on_and_changed_strips_are_made_anew(tmp_path: Path) -> None:

@@ -90,6 +90,22 @@ def test_the_folder_keeps_the_contract(made: Made) -> None:
         )
 
 
+def test_flags_and_contacts_lie_beside_the_map_whichever_way_it_is_made(made: Made) -> None:
+    flags = []
+    for folder in (made.whole, made.tiled):
+        grid = read_map(folder / "map.tif")
+        with rasterio.open(folder / "flags.tif") as raster:
+            flags.append(raster.read(1))
+            assert raster.nodata == 255 and raster.tags()["FLAG_8"] == "shadow"
+        np.testing.assert_array_equal(flags[-1] == 255, np.isnan(grid.elevation_m))
+        page = (folder / "contacts.html").read_text()
+        assert "<h1>Contacts</h1>" in page
+        said = json.loads((folder / "metrics.json").read_text())
+        assert 0.0 <= said["flag_shadow_share"] < 0.5 and said["prior_shift_sigma_m"] > 0
+    # Poses differ by millimetres, so that a cell in a thousand or so gets another datum.
+    assert (flags[0] != flags[1]).mean() < 0.01
+
+
 @pytest.mark.parametrize("kind", ["whole", "tiled"])
 def test_every_file_is_tied_to_the_prior_map(made: Made, kind: str) -> None:
     folder = getattr(made, kind)

@@ -19,7 +19,6 @@ import pytest
 
 from mapping.fixes import read_fixes
 from mapping.graph_files import read_g2o
-from mapping.pose_graph_files import read_graph
 from perception.readers import open_survey
 from perception.records import InputError
 from scenarios.benchmarks.inversion import looks_of
@@ -29,6 +28,7 @@ from scenarios.schema import load_scenario
 from scenarios.simulation import Simulation, simulate
 from scenarios.simulation_files import _log, write_simulation
 from scenarios.sonar.xtf import SonarLog, write_xtf
+from tests.mapping.gtsam_text import read_graph, solved_anew
 from tests.scenarios.command_line import Outcome, run_command
 from tests.scenarios.tiny import write_tiny
 
@@ -77,7 +77,14 @@ def track(folder: Path) -> dict[str, np.ndarray]:
         rows = list(csv.DictReader(stream))
     return {
         name: np.array([float(row[name]) for row in rows])
-        for name in ("easting_m", "northing_m", "ping", "pass")
+        for name in (
+            "easting_m",
+            "northing_m",
+            "ping",
+            "pass",
+            "sigma_easting_m",
+            "sigma_northing_m",
+        )
     }
 
 
@@ -105,6 +112,41 @@ def test_the_folder_holds_rounds_and_graph_and_the_tie_to_a_prior_map(
     assert np.isfinite(graph.error(values))
     poses = read_g2o(tmp_path / "map" / "graph.g2o")
     assert len(poses.key) > 3 and len(poses.fixed) == 1
+
+
+def test_pass_by_pass_ends_where_the_batch_on_the_same_factors_ends(
+    simulated: tuple[Simulation, Path],
+    lines: list[SonarLog],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The file's graph solved at once from nothing gives the track that grew; all at once lies within sigma."""
+    _, survey = simulated
+    fixes = ("--fixes", survey / "surface-fixes.csv")
+    tracks = []
+    for name, options in (("grown", ("--incremental",)), ("batch", ())):
+        folder = tmp_path / name
+        folder.mkdir()
+        done = mapped(capsys, folder, lines, *fixes, *options)
+        assert done.status == 0, done.err
+        tracks.append(track(folder))
+    graph, values = read_graph(tmp_path / "grown" / "map")
+    anew = solved_anew(graph, values)
+    keys = values.keys()
+    for key in keys:
+        np.testing.assert_allclose(values.atVector(key), anew.atVector(key), atol=1e-5)
+    grown, batch = tracks
+    for axis in ("easting", "northing"):
+        apart = grown[f"{axis}_m"] - batch[f"{axis}_m"]
+        sigma = np.hypot(grown[f"sigma_{axis}_m"], batch[f"sigma_{axis}_m"])
+        assert np.sqrt(((apart / sigma) ** 2).mean()) < 2.0
+
+
+def test_in_tiles_a_track_pass_by_pass_is_refused(
+    lines: list[SonarLog], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = mapped(capsys, tmp_path, lines[:1], "--incremental", "--tiles")
+    assert done.status == 1 and "--incremental" in done.err and done.err.count("\n") == 1
 
 
 def test_passes_that_never_meet_are_mapped_where_their_navigation_has_them(
