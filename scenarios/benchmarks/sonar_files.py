@@ -53,7 +53,7 @@ def run(progress: Progress) -> Table:
         for number, times in enumerate((1, _TIMES)):
             path = Path(folder) / f"{times}.xtf"
             n = times * _PINGS
-            _write(path, n, progress)
+            write_lines(path, n, _LINE_M, progress)
             case = f"{n:,} pings of 2 x {_SAMPLES:,}"
             progress("reading", number, 2)
             scan, samples, grown = _measured(_OURS, path)
@@ -84,8 +84,8 @@ def _measured(program: str, path: Path) -> tuple[float, float, float]:
     return first, second, grown
 
 
-def _write(path: Path, n: int, progress: Progress) -> None:
-    """Write lines of 400 m, 40 m apart, up and down, 5 Hz at 2 m/s; the echoes are noise."""
+def write_lines(path: Path, n: int, line_m: float, progress: Progress) -> None:
+    """Write `n` pings on lines of `line_m`, 40 m apart, up and down, 5 Hz at 2 m/s; the echoes are noise."""
     rng = np.random.default_rng(0)
     header = XTFFileHeader()
     header.NavUnits, header.NumberOfSonarChannels = 0, 2
@@ -96,16 +96,16 @@ def _write(path: Path, n: int, progress: Progress) -> None:
     echoes = [
         (level * rng.exponential(1.0, _SAMPLES)).clip(0, 60000).astype("<u2") for _ in range(64)
     ]
-    per_line = int(_LINE_M / _SPEED_M_S * _RATE_HZ)
+    per_line = int(line_m / _SPEED_M_S * _RATE_HZ)
     with path.open("wb") as stream:
         stream.write(bytes(header))
         for i in range(n):
-            stream.write(_ping(i, per_line, echoes[i % 64]))
+            stream.write(_ping(i, per_line, line_m, echoes[i % 64]))
             if i % 5000 == 0:
                 progress("writing", i, n)
 
 
-def _ping(i: int, per_line: int, echo: np.ndarray) -> bytes:
+def _ping(i: int, per_line: int, line_m: float, echo: np.ndarray) -> bytes:
     line, along = divmod(i, per_line)
     north_m = along * _SPEED_M_S / _RATE_HZ
     ping = XTFPingHeader()
@@ -115,7 +115,7 @@ def _ping(i: int, per_line: int, echo: np.ndarray) -> bytes:
     ping.Second, ping.HSeconds = int(seconds % 60), int(seconds % 1 * 100)
     ping.PingNumber, ping.NumChansToFollow, ping.SoundVelocity = i, 2, 1500.0
     ping.SensorXcoordinate = 500000.0 + 40.0 * line
-    ping.SensorYcoordinate = 5e6 + (north_m if line % 2 == 0 else _LINE_M - north_m)
+    ping.SensorYcoordinate = 5e6 + (north_m if line % 2 == 0 else line_m - north_m)
     ping.SensorHeading = 180.0 * (line % 2)
     ping.SensorDepth, ping.SensorPrimaryAltitude = 20.0, 10.0
     body = b""
