@@ -15,14 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from localization.constellation import (
-    Constellation,
-    ConstellationMatch,
-    Landmarks,
-    Placement,
-    find_landmarks,
-)
-from localization.correlation import Match, Matching, match_patch, verify
+from localization.constellation import Constellation, ConstellationMatch, Placement
+from localization.correlation import Matching, match_patch
+from localization.landmarks import Landmarks, find_landmarks
+from localization.refinement import Match, verify
 from localization.rescaled import cells_of, in_cells, without_white_error
 from perception.records import FloatArray, Grid, IntArray
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from localization.compact import CompactMap, match_compact
 from localization.constellation import Placement
-from localization.correlation import Match, match_patch
+from localization.correlation import match_patch
 from localization.integrity import protection_level
+from localization.refinement import Match
 from localization.rescaled import cells_of, in_cells, without_white_error
 from perception.records import FloatArray, Grid, InputError
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from localization.correlation import smoothed
 from localization.maperror import assumed_sigma, filter_map
+from localization.refinement import smoothed
 from perception.records import FloatArray, Grid
 
 # Cells that agree to this part are of one size.

@@ -20,7 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.compact import CompactMap
-from localization.constellation import Constellation, Landmarks, find_landmarks
+from localization.constellation import Constellation
+from localization.landmarks import Landmarks, find_landmarks
 from localization.placing import Place, Placing, place_on_compact, place_on_raster
 from perception.records import FloatArray, Grid, Progress
 from scenarios.benchmarks import Row, Table

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localization.constellation import Constellation, Landmarks, find_landmarks, turned
+from localization.constellation import Constellation, turned
+from localization.landmarks import Landmarks, find_landmarks
 from localization.particles import ParticleFilter
 from localization.terrain import TerrainMap, terrain_map
 from localization.witness import Opinion, opinion_of

@@ -6,7 +6,7 @@ import navsets
 import numpy as np
 import pytest
 
-from localization.correlation import masked_ncc, match_patch, rotated
+from localization.correlation import Spectra, masked_ncc, match_patch, rotated
 from localization.integrity import protection_level
 from localization.measurements import Sensors
 from localization.observability import ObservabilityConfig, bound_at
@@ -30,7 +30,7 @@ def patch_at(
 def test_masked_correlation_is_numpy_s_where_nothing_is_masked() -> None:
     rng = np.random.default_rng(0)
     values, patch = rng.standard_normal((20, 24)), rng.standard_normal((6, 5))
-    ncc = masked_ncc(values, patch, 30)
+    ncc, _ = masked_ncc(Spectra(values, patch.shape), patch, 30)
     for i, j in ((0, 0), (7, 11), (14, 19)):
         expected = np.corrcoef(values[i : i + 6, j : j + 5].ravel(), patch.ravel())[0, 1]
         assert ncc[i + 5, j + 4] == pytest.approx(expected, abs=1e-9)
