@@ -9,8 +9,9 @@ import pytest
 
 from mapping import rounds
 from mapping.rounds import affordable_cell, known_floor
+from mapping.survey import correct_survey
 from perception.records import ElevationStrip
-from tests.mapping.worlds import Drift, World, fly
+from tests.mapping.worlds import Drift, World, fly, make_world
 
 
 def strips_apart(far_m: float) -> list[ElevationStrip]:
@@ -43,3 +44,21 @@ def test_the_floor_of_a_wide_survey_has_wider_cells_and_the_same_height(
     assert floor is not None and floor.elevation_m.size <= 1.02 * 40_000
     there = floor.sample(strips[1].easting_m, strips[1].northing_m)
     np.testing.assert_allclose(there, -40.0, atol=0.5)
+
+
+def test_any_number_of_threads_finds_the_same_track_to_the_bit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(2)
+    legs = [(100.0, 20.0, 0.0, 120.0), (20.0, 80.0, 90.0, 160.0)]
+    flown = fly(make_world(rng, size=256), legs, rng, Drift())
+    results = []
+    for threads in (1, 2, 5):
+        monkeypatch.setattr(rounds, "_THREADS", threads)
+        results.append(correct_survey([f.strip for f in flown]))
+    assert results[0].links
+    for other in results[1:]:
+        np.testing.assert_array_equal(other.solution.correction_m, results[0].solution.correction_m)
+        np.testing.assert_array_equal(
+            other.solution.covariance_m2, results[0].solution.covariance_m2
+        )
