@@ -94,8 +94,8 @@ class BumpFit:
 
 _FACETS_PER_BIN = 1.5
 # Rounds of climbing: every start on the coarse patch, the best of those, and the leaders in full.
-_FIRST_ROUNDS, _MIDDLE_ROUNDS, _LAST_ROUNDS = 3, 5, 14
-_MIDDLE_STARTS, _LAST_STARTS = 3, 2
+_FIRST_ROUNDS, _MIDDLE_ROUNDS, _LAST_ROUNDS = 3, 5, 10
+_MIDDLE_STARTS, _LAST_STARTS = 2, 2
 # A kind this far behind the other after the coarse rounds will not catch up.
 _BEHIND = 0.6
 # Profiles that end (powers of `Form`), climbed beside the best generalised Gaussian; cones are rare, by so much
