@@ -5,12 +5,12 @@ counts soundings that share a map error as fewer. Two things it leaves out:
 
 - over weak ground the likelihood has other hills, and a vehicle with 50 m of doubt ends up on them now
   and then: the error is larger;
-- the error's correlation is not known, and a search takes it for one that it is not.
+- a stated error leaves its correlation open: the bound assumes one length, the soundings find theirs.
 
 Both depend on the ground as a whole, so they are found there. Lines are drawn over the map, soundings are
 simulated with noise and a map error of one of the correlation lengths it may have, and the place is
 estimated as the search does it: the mean of the posterior of the shift on a grid, depth bias
-marginalised, the map's error counted by its sharing. How the mean square of what it misses rises with
+marginalised, the map's error of that length counted by its sharing. How the mean square of what it misses rises with
 the bound is fitted by isotonic regression, and applied to the raster.
 """
 
@@ -59,8 +59,7 @@ class Line:
 
 
 def square_miss(
-    truth_m: FloatArray,
-    map_m: FloatArray,
+    height_m: FloatArray,
     frame: Frame,
     line: Line,
     bound_m: float,
@@ -70,8 +69,8 @@ def square_miss(
 
     Parameters
     ----------
-    truth_m, map_m : (rows, cols) the ground as it is, and as the search reads it; `frame` of both.
-    bound_m : linear bound of the line. What the grid is too coarse to tell is taken from it.
+    height_m, frame : the ground as it is expected, as a `Reading` has it.
+    bound_m : linear bound of the line: the least answer where it is finer than the grid.
     """
     n = len(line.east_m)
     noise = np.linalg.cholesky(line.covariance_m2) @ rng.standard_normal((n, _DRAWS))
@@ -82,7 +81,8 @@ def square_miss(
     start = line.start_m * rng.standard_normal((2, _DRAWS))
     still = np.zeros(1)
     # The true place is a node; what is known beforehand lies off it.
-    apart = _heights(truth_m, frame, line, still, still) - _heights(map_m, frame, line, east, north)
+    truth = _heights(height_m, frame, line, still, still)
+    apart = truth - _heights(height_m, frame, line, east, north)
     off = ~np.isfinite(apart)
     apart[off] = 0.0
     weight = np.where(off, 0.0, 1.0 / line.assumed_m2[:, None])
@@ -100,7 +100,7 @@ def square_miss(
     posterior = np.exp(log - log.max(axis=1, keepdims=True))
     posterior /= posterior.sum(axis=1, keepdims=True)
     miss = (posterior @ east) ** 2 + (posterior @ north) ** 2
-    return max(float(miss.mean()), bound_m**2)
+    return max(float(miss.mean()), min(bound_m, _FINEST_M) ** 2)
 
 
 def _heights(

@@ -132,11 +132,7 @@ def simulated(
             line = _line_over(terrain, reading, sensors, config, (heading, row, col))
             if np.isfinite(terrain.heights(line.east_m, line.north_m)).all():
                 bound.append(float(bounds_m[heading, row, col]))
-                square.append(
-                    square_miss(
-                        reading.height_m, terrain.height_m, terrain.frame, line, bound[-1], rng
-                    )
-                )
+                square.append(square_miss(reading.height_m, terrain.frame, line, bound[-1], rng))
                 break
     if len(bound) < config.lines / 4 or not bound:
         return None
@@ -163,7 +159,10 @@ def _line_over(
     apart = np.hypot(east[:, None] - east, north[:, None] - north)
     covariance = reading.shared_m**2 * np.exp(-apart / reading.length_m)
     covariance += np.diag(range_m2 + terrain.error.between_m**2 + 1e-9)
-    shared = _shared_variance(terrain, config, slant * np.hypot(vectors[:, 0], vectors[:, 1]))
+    parts = ((reading.shared_m**2, reading.length_m),)
+    shared = _shared_variance(
+        terrain, config, slant * np.hypot(vectors[:, 0], vectors[:, 1]), parts
+    )
     return Line(east, north, covariance, range_m2 + shared, sensors.start_m, sensors.depth_bias_m)
 
 
@@ -192,7 +191,14 @@ def bound_at(
     )  # fmt: skip
     kernel = _line(terrain, config.path_m, heading_rad)
     lines = [_along(np.where(known, p, 0.0), kernel) for p in products]
-    shared = _shared_variance(terrain, config, slant * np.hypot(vectors[:, 0], vectors[:, 1]))
+    error = terrain.error
+    length = error.length_m if np.isfinite(error.length_m) else DEFAULT_LENGTH_M
+    parts = (
+        (error.filtered_m**2, error.filtered_length_m), (error.correlated_m**2, length),
+    )  # fmt: skip
+    shared = _shared_variance(
+        terrain, config, slant * np.hypot(vectors[:, 0], vectors[:, 1]), parts
+    )
     for b in range(len(slant)):
         weight = per_line / (noise[b] ** 2 + shared)
         east, north = _offset(slant[b] * vectors[b], heading_rad)
@@ -241,15 +247,21 @@ def _offset(ray_m: FloatArray, heading_rad: float) -> tuple[float, float]:
     return float(ray_m[0] * s + ray_m[1] * c), float(ray_m[0] * c - ray_m[1] * s)
 
 
-def _shared_variance(terrain: TerrainMap, config: ObservabilityConfig, out_m: FloatArray) -> float:
-    """Map error with its sharing, and what interpolation misses."""
-    error = terrain.error
-    length = error.length_m if np.isfinite(error.length_m) else DEFAULT_LENGTH_M
-    total = error.between_m**2
-    for variance, reach in (
-        (error.filtered_m**2, error.filtered_length_m),
-        (error.correlated_m**2, length),
-    ):
+def _shared_variance(
+    terrain: TerrainMap,
+    config: ObservabilityConfig,
+    out_m: FloatArray,
+    parts: tuple[tuple[float, float], ...],
+) -> float:
+    """Map error with its sharing, and what interpolation misses.
+
+    Parameters
+    ----------
+    out_m : (beams,) reach of the beams to the side.
+    parts : variance and correlation length of the map's error.
+    """
+    total = terrain.error.between_m**2
+    for variance, reach in parts:
         # Beams 90 degrees apart are sqrt(2) of their reach to the side from one another.
         beams = 1.0 + (len(out_m) - 1) * np.exp(-np.sqrt(2) * float(np.mean(out_m)) / reach)
         total += variance * (1.0 + 2.0 * reach / config.spacing_m) * beams

@@ -36,7 +36,7 @@ _GROUNDS = {
     "1 m": replace(_BASE, relief_m=1.0),
     "0.3 m": replace(_BASE, relief_m=0.3, hurst=0.8, outer_m=800.0),
 }
-_STREAM = 412
+_STREAM = 931
 # From the map's edge, in metres: half a line, the beams' reach and the start's error.
 _MARGIN_M = 350.0
 
