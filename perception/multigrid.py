@@ -161,7 +161,7 @@ class Level:
     height: Spectrum
     albedo: Spectrum
     tie: Tie
-    coupling: Coupling | None = None
+    coupling: Coupling
     diagonal: tuple[FloatArray, FloatArray] = field(init=False)
     largest: float = field(init=False)
 
@@ -321,7 +321,7 @@ class Hierarchy:
         height: Spectrum,
         albedo: Spectrum,
         tie: Tie,
-        coupling: Coupling,
+        couplings: Sequence[Coupling],
         gain_block: FloatArray,
     ) -> Hierarchy:
         """Build all grids down to the one that is factorised.
@@ -330,20 +330,21 @@ class Hierarchy:
         ----------
         moments : the data of the finest grid, (10, rows - 1, cols - 1).
         tie : equations on heights.
-        coupling : of the finest grid's first coarsening (of the grid itself where it is solved directly).
+        couplings : of the finest grid and, as far as they are at hand, of the next ones.
         gain_block : normal matrix of the gains alone, data and prior.
         """
         data: FeatureData | CornerData = FeatureData(moments, cell_m)
-        levels = [Level(cell_m, data, height, albedo, tie)]
+        levels = [Level(cell_m, data, height, albedo, tie, couplings[0])]
         while can_halve(levels[-1].shape):
             fine = levels[-1]
             data = coarser(fine.data)
             nodes = (data.shape[0] + 1, data.shape[1] + 1)
-            tied = coupling if len(levels) == 1 else coupling.coarser(prolongation_matrix(*nodes))
-            coupling = tied
-            levels.append(
-                Level(2 * fine.cell_m, data, height, albedo, fine.tie.coarser(nodes), tied)
-            )
+            if len(levels) < len(couplings):
+                coupling = couplings[len(levels)]
+            else:
+                coupling = fine.coupling.coarser(prolongation_matrix(*nodes))
+            tie = fine.tie.coarser(nodes)
+            levels.append(Level(2 * fine.cell_m, data, height, albedo, tie, coupling))
         last = levels[-1]
         matrix = level_matrix(
             last.data.local(),
@@ -352,7 +353,7 @@ class Hierarchy:
             last.tie.matrix,
             last.tie.weight,
         )
-        return cls(levels, CoarseSolver.build(matrix, coupling.dense(), gain_block))
+        return cls(levels, CoarseSolver.build(matrix, last.coupling.dense(), gain_block))
 
     def cycle(
         self, b_z: FloatArray, b_a: FloatArray, b_g: FloatArray, at: int = 0
@@ -360,8 +361,9 @@ class Hierarchy:
         """Return an approximate solution for the right-hand side: symmetric, and positive.
 
         Before and after the coarser grids' part the fields are smoothed; gains move on the coarsest grid alone, but
-        what they and the fields do to one another's residual is taken along. On the finest grid that
-        is the coupling of the next one, read through restriction and interpolation.
+        what they and the fields do to one another's residual is taken along on every grid. Left out on the finest
+        grid, or read there through the next one's, it costs little where looks cross; with one pass alone
+        it trebles the steps.
         """
         if at == len(self.levels) - 1:
             return self.coarsest.solve(b_z, b_a, b_g)
@@ -369,30 +371,13 @@ class Hierarchy:
         z, a = np.zeros(level.shape), np.zeros(level.shape)
         level.smooth(z, a, b_z, b_a)
         y_z, y_a = level.apply(z, a)
-        felt = b_g - self._gains_of(z, a, at)
+        felt = b_g - level.coupling.gains_of(z, a)
         c_z, c_a, gain = self.cycle(restrict(b_z - y_z), restrict(b_a - y_a), felt, at + 1)
         z += prolong(c_z)
         a += prolong(c_a)
-        of_z, of_a = self._fields_of(gain, at)
+        of_z, of_a = level.coupling.fields_of(gain)
         level.smooth(z, a, b_z - of_z, b_a - of_a)
         return z, a, gain
-
-    def _gains_of(self, z: FloatArray, a: FloatArray, at: int) -> FloatArray:
-        own = self.levels[at].coupling
-        if own is not None:
-            return own.gains_of(z, a)
-        below = self.levels[at + 1].coupling
-        assert below is not None
-        return 0.25 * below.gains_of(restrict(z), restrict(a))
-
-    def _fields_of(self, gain: FloatArray, at: int) -> tuple[FloatArray, FloatArray]:
-        own = self.levels[at].coupling
-        if own is not None:
-            return own.fields_of(gain)
-        below = self.levels[at + 1].coupling
-        assert below is not None
-        z, a = below.fields_of(0.25 * gain)
-        return prolong(z), prolong(a)
 
 
 def can_halve(shape: tuple[int, int]) -> bool:

@@ -94,14 +94,18 @@ class Problem:
         block = self.gain_precision.copy()
         gain_normal(self.knot, self.share, self.weight, block)
         self.gain_block = block
-        coupling = Coupling.of_rows(
-            self.shape, self.cell_m, 1 if can_halve(self.shape) else 0,
-            (self.cell, self.weight, self.c_east, self.c_north, self.c_level),
-            self.knot, self.share, len(block),
-        )  # fmt: skip
+        # Gathering the second grid's from the rows is quicker than adding up the first one's.
+        couplings = [
+            Coupling.of_rows(
+                self.shape, self.cell_m, depth,
+                (self.cell, self.weight, self.c_east, self.c_north, self.c_level),
+                self.knot, self.share, len(block),
+            )
+            for depth in range(2 if can_halve(self.shape) else 1)
+        ]  # fmt: skip
         self.hierarchy = Hierarchy.build(
             self.cell_m, moments.reshape(10, rows - 1, cols - 1), self.height, self.albedo,
-            Tie.of(self.rows, self.row_weight), coupling, block,
+            Tie.of(self.rows, self.row_weight), couplings, block,
         )  # fmt: skip
 
     def apply(self, z: FloatArray, a: FloatArray, gain: FloatArray) -> Fields:
