@@ -32,7 +32,7 @@ def log_power(slant_m: FloatArray, rise_m: float, bent: float = 0.0) -> FloatArr
     slant, angle = np.hypot(ground, drop), np.arctan2(ground, drop)
     tangent = slant * np.gradient(angle, slant)
     law = 2 * np.log(tangent) - 0.5 * np.log1p(tangent**2)
-    return np.interp(slant_m, slant, law)
+    return np.asarray(np.interp(slant_m, slant, law))
 
 
 def one_ray() -> Rows:
@@ -81,10 +81,11 @@ def test_log_power_changes_with_slope_as_the_law_says() -> None:
 
 def nothing() -> Data:
     """Return no data at all."""
-    none = np.zeros(0)
-    whole = np.zeros(0, np.int64)
-    columns = {name: none for name in Rows.__dataclass_fields__}
-    rows = Rows(**{**columns, "cell": whole, "side": whole, "look": whole})
+    none, whole = np.zeros(0), np.zeros(0, np.int64)
+    rows = Rows(
+        cell=whole, c_east=none, c_north=none, c_level=none, ratio=none, ground_m=none, drop_m=none,
+        slope=none, angle_rad=none, slant_m=none, share=none, samples=none, side=whole, look=whole,
+    )  # fmt: skip
     return Data(rows, none, none, none, np.zeros((0, 4), np.int64), np.zeros((0, 4)))
 
 
