@@ -17,7 +17,7 @@ from perception.records import FloatArray
 _ONE_SIDED_PART = 0.8
 # Long waves are few among the unknowns and hold nearly all of the spread: they are solved to a sigma in all, not
 # to a part of the whole.
-_TOLERANCE = 0.5
+_TOLERANCE = 1.0
 # Samples in hand together: threads share them, and memory holds no more.
 _AT_ONCE = 4
 

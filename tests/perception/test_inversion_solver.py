@@ -231,7 +231,7 @@ def test_no_smoother_is_built_on_too_small_an_eigenvalue() -> None:
 
 
 @pytest.mark.usefixtures("many_grids")
-@pytest.mark.parametrize(("crossed", "most"), [(True, 18), (False, 60)])
+@pytest.mark.parametrize(("crossed", "most"), [(True, 18), (False, 90)])
 def test_few_steps_solve_firm_slopes(crossed: bool, most: int) -> None:
     """Along both axes, and from one side alone, where slopes and gain explain the same echoes."""
     problem = crossed_problem(np.random.default_rng(9), crossed)
