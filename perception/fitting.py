@@ -100,7 +100,7 @@ _MIDDLE_STARTS, _LAST_STARTS = 2, 2
 _BEHIND = 0.6
 # Profiles that end (powers of `Form`), climbed beside the best generalised Gaussian; cones are rare, by so much
 # evidence. Evidence counts a third: no family is true, and what it cannot have is taken for proof.
-_ENDED, _RARE, _TEMPER = (1.0, 2.0), 2.0, 3.0
+_ENDED, _RARE, _TEMPER = (1.0, 2.0), 5.0, 3.0
 # Halving a patch of fewer bins would leave too little of it.
 _LEAST_BINS = 36
 
