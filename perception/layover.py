@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from perception.geometry import slant_range
 from perception.records import BoolArray, FloatArray
 
 
@@ -35,7 +36,7 @@ def layover_cells(
         # Angles from straight below rise outward; what lies under the greatest so far is hidden.
         angle = np.where(np.isfinite(below), np.arctan2(x, below), -np.inf)
         visible = np.isfinite(below) & (angle >= np.maximum.accumulate(angle, axis=1))
-        slant = np.hypot(x, np.nan_to_num(below))
+        slant = slant_range(x, np.nan_to_num(below))
         before = np.maximum.accumulate(np.where(visible, slant, -np.inf), axis=1)
         behind = np.minimum.accumulate(np.where(visible, slant, np.inf)[:, ::-1], axis=1)[:, ::-1]
         folded = (slant < before - sample_m) | (slant > behind + sample_m)
@@ -55,7 +56,7 @@ def candidates(
     x, drop = np.abs(across_m), sonar_m - profile_m
     angle = np.arctan2(x, drop)
     visible = angle >= np.maximum.accumulate(angle)
-    miss = np.hypot(x, drop) - slant_m
+    miss = slant_range(x, drop) - slant_m
     crosses = (miss[:-1] * miss[1:] <= 0) & (miss[:-1] != miss[1:]) & visible[:-1] & visible[1:]
     k = np.flatnonzero(crosses)
     return np.asarray(x[k] + (x[k + 1] - x[k]) * miss[k] / (miss[k] - miss[k + 1]))

@@ -87,11 +87,3 @@ SENSORS = (
     Sensor("compass", "heading_deg", "0.5 deg", "from true north; orients the beams"),
     Sensor("depth", "depth_m", "bias 1 m", "down from the surface"),
 )  # fmt: skip
-
-
-def sonar_named(name: str) -> Sonar:
-    """Return the data sheet of a sonar; a `KeyError` names the ones there are."""
-    for sonar in SONARS:
-        if sonar.name == name:
-            return sonar
-    raise KeyError(f"no sonar {name!r}; there are {', '.join(s.name for s in SONARS)}")
