@@ -26,6 +26,9 @@ _DISTINCT = 12.0
 # The best of all wrong places reaches 20 to 30: e^18 places and turns on a thousand cells a side, each
 # fitted. As sure again as above, and some for ground that repeats itself.
 _CHANCE = 45.0
+# The same over all octaves at once: of strong, smooth, real grounds wrong places had 0, right ones above
+# 1,000; patches of weak relief on a thumbnail have some 100.
+_PLAIN = 60.0
 # Places are ranked without what a Gaussian of this part of the patch keeps, but of so many cells at least
 # (of parts of 3, 6 and 12 the last ranked best, docs/terrain-navigation.md).
 _LONGEST_PART, _SHARPEST = 12.0, 2.0
@@ -238,6 +241,8 @@ def _judge(matches: list[Match]) -> Matching:
     where = f"log likelihood ratio {best.evidence:.0f} against unrelated ground"
     if not np.isfinite(best.covariance).all() or best.evidence < _CHANCE:
         reason = f"no place fits: {where}, {_CHANCE:g} needed"
+    elif best.plain < _PLAIN:
+        reason = f"no place fits: what the best leaves looks like ground ({best.plain:.0f}, {_PLAIN:g} needed)"
     elif margin < _DISTINCT:
         reason = f"ambiguous: {where}, {margin:.1f} above the next place, {_DISTINCT:g} needed"
     else:

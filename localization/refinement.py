@@ -35,6 +35,7 @@ class Match:
     misfit_m : rms of what is left after removing the mean.
     independent : number of independent values in what is left.
     evidence : log likelihood ratio of the place against ground of no relation to the patch.
+    plain : the same over all octaves at once, counting the independent values of what is left.
     """
 
     row: float
@@ -45,6 +46,7 @@ class Match:
     misfit_m: float
     independent: float = 0.0
     evidence: float = 0.0
+    plain: float = 0.0
 
 
 def verify(values: FloatArray, patch: FloatArray, start: Match, free_turn: bool) -> Match:
@@ -79,6 +81,7 @@ def verify(values: FloatArray, patch: FloatArray, start: Match, free_turn: bool)
         misfit_m=float(miss.std()),
         independent=independent,
         evidence=evidence_of(patch, _misfit(values, patch, full)),
+        plain=_plain(patch, _misfit(values, patch, full)),
     )
 
 
@@ -98,11 +101,11 @@ def evidence_of(patch: FloatArray, miss: FloatArray) -> float:
     values that the octave has on the common cells. One number for all octaves would be misled twice: a
     white noise hides that what is left of the long waves looks like terrain, and a smooth stretch of map
     "fits" short waves better than a rough one. An octave that the place does not explain counts nothing.
+    Nor does slope or bend of the patch as a whole: any hillside has them.
     """
     common = np.isfinite(miss)
     cells = float(common.sum())
-    own, left = np.where(common, patch, np.nan), miss
-    own, left = own - np.nanmean(own), left - np.nanmean(left)
+    own, left = _without_bend(np.where(common, patch, np.nan)), miss - np.nanmean(miss)
     width, total, values = 0.0, 0.0, cells
     while values > _FEWEST_VALUES:
         next_width = max(2.0 * width, 1.0)
@@ -113,6 +116,27 @@ def evidence_of(patch: FloatArray, miss: FloatArray) -> float:
         total += 0.5 * (values - fewer) * max(float(np.log(before / max(after, 1e-30))), 0.0)
         own, left, width, values = smooth_own, smooth_left, next_width, fewer
     return total
+
+
+def _plain(patch: FloatArray, miss: FloatArray) -> float:
+    """Evidence by all of the variance at once.
+
+    What a wrong place leaves of strong and smooth ground is smooth as well: it has few independent values,
+    and all octaves see the same few. What the right place leaves is noise, which has many.
+    """
+    own = _without_bend(np.where(np.isfinite(miss), patch, np.nan))
+    ratio = float(np.nanvar(own)) / max(float(np.nanvar(miss)), 1e-30)
+    return 0.5 * _independent(miss) * max(float(np.log(max(ratio, 1e-30))), 0.0)
+
+
+def _without_bend(values: FloatArray) -> FloatArray:
+    """Take off the surface of second degree that fits best; NaN stays."""
+    known = np.isfinite(values)
+    row, col = (np.linspace(-1, 1, n) for n in values.shape)
+    r, c = np.meshgrid(row, col, indexing="ij")
+    terms = np.stack([np.ones_like(r), r, c, r * r, r * c, c * c], axis=-1)
+    weights = np.linalg.lstsq(terms[known], values[known], rcond=None)[0]
+    return values - terms @ weights
 
 
 class _Fit:
