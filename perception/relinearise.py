@@ -79,6 +79,8 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
         problem = linear_problem(state, data, both(equations, held), caution)
         fields = (state.surface, state.albedo, state.gain)
         solution, used = problem.solve(fields, problem.right_side())
+        # The grids of a large map take hundreds of megabytes: the next step's come in their place.
+        del problem
         seen = np.zeros(state.shape, bool)
         seen[:-1, :-1] = passed & ~single if np.any(passed & ~single) else passed
         step = float(np.sqrt(np.mean((solution[0] - state.surface)[seen] ** 2)))
