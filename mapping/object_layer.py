@@ -65,6 +65,11 @@ def read_objects(path: Path, grid: Grid) -> ObjectLayer:
         ) from error
     columns: Mapping[str, Any] = dict(zip(meta["fields"], values, strict=True))
     east, north = _positions(path, meta, geometry, columns, grid)
+    nowhere = np.flatnonzero(~(np.isfinite(east) & np.isfinite(north)))
+    if len(nowhere):
+        raise InputError(
+            f"{path}: object {nowhere[0] + 1} of {len(east)} has no position; give it one or remove the row"
+        )
     height_m = np.abs(_numbers(path, columns, "height_m", len(east)))
     cell_m = max(grid.cell_m, grid.cell_north_m)
     radius_m = np.full(len(east), np.nan)

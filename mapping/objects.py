@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -42,7 +42,8 @@ class Looks(Protocol):
 class MergedObjects:
     """One row per object: position and height with sigma, looks and passes, and whether it is disputed.
 
-    `disputed` marks an object beside which another pass saw something else: the other kind, or a height
+    `radius_m` is the footprint's, NaN where no look has one; `least` marks heights that are only the least that open
+    shadows prove. `disputed` marks an object beside which another pass saw something else: the other kind, or a height
     that differs by more than the sigmas allow. Both are kept. `look` gives the object of each look of
     the tables, one after the other.
     """
@@ -57,6 +58,8 @@ class MergedObjects:
     passes: IntArray
     disputed: npt.NDArray[np.bool_]
     look: IntArray
+    radius_m: FloatArray
+    least: npt.NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -69,7 +72,9 @@ def merge_objects(
 
     Looks of one kind within three position sigmas whose heights agree become one, nearest pairs first; two
     looks of one pass never do, as a pass sees an object once. Heights and positions are weighted by
-    inverse variance; where looks of one object spread more than their sigmas, its sigma grows likewise.
+    inverse variance; where looks of one object spread more than their sigmas, its sigma grows likewise. A look
+    whose shadow runs out of the swath tells a least height only: it counts where no look of the object tells more,
+    and then the greatest of them.
 
     Parameters
     ----------
@@ -82,9 +87,11 @@ def merge_objects(
     height, sigma = _column(tables, "height_m"), _column(tables, "sigma_m")
     kind = np.array([k for t in tables for k in t.kind], dtype=object)
     sigma = np.maximum(np.nan_to_num(sigma, nan=1.0), 1e-3)
+    least, radius = _optional(tables, "lower_bound", bool), _radius(tables)
     where = np.hypot(_CENTRE_SIGMA_M, position[owner]) if len(owner) else np.zeros(0)
-    group, rivals = _group(points, where, owner, kind, height, sigma)
-    return _summarise(points, where, owner, kind, height, sigma, group, rivals)
+    group, rivals = _group(points, where, owner, kind, height, sigma, least)
+    merged = _summarise(points, where, owner, kind, height, sigma, group, rivals)
+    return _with_extent(merged, height, sigma, least, radius)
 
 
 def _column(tables: Sequence[Looks], name: str) -> FloatArray:
@@ -95,7 +102,7 @@ def _column(tables: Sequence[Looks], name: str) -> FloatArray:
 
 def _group(
     points: FloatArray, where: FloatArray, owner: IntArray, kind: npt.NDArray[Any], height: FloatArray,
-    sigma: FloatArray,
+    sigma: FloatArray, least: npt.NDArray[np.bool_],
 ) -> tuple[IntArray, list[tuple[int, int]]]:  # fmt: skip
     """Return each look's group, and the pairs of looks that contradict each other."""
     n = len(points)
@@ -113,7 +120,10 @@ def _group(
     for i, j in pairs[np.argsort(apart, kind="stable")]:
         if owner[i] == owner[j]:
             continue
-        agree = abs(height[i] - height[j]) <= _AGREE_SIGMA * np.hypot(sigma[i], sigma[j])
+        higher = height[i] - height[j]
+        # A least height agrees with any greater one.
+        apart_m = 0.0 if (least[i] and higher < 0) or (least[j] and higher > 0) else abs(higher)
+        agree = apart_m <= _AGREE_SIGMA * np.hypot(sigma[i], sigma[j])
         if kind[i] != kind[j] or not agree:
             rivals.append((int(i), int(j)))
             continue
@@ -154,7 +164,53 @@ def _summarise(
         passes=np.array([len(set(owner[look == k])) for k in range(n)], np.int64),
         disputed=disputed,
         look=look,
+        radius_m=np.full(n, np.nan),
+        least=np.zeros(n, bool),
     )
+
+
+def _with_extent(
+    merged: MergedObjects, height: FloatArray, sigma: FloatArray, least: npt.NDArray[np.bool_],
+    radius: FloatArray,
+) -> MergedObjects:  # fmt: skip
+    """Return the objects with their footprints, and with heights told apart from least heights."""
+    n, look = len(merged), merged.look
+    widest = np.full(n, -np.inf)
+    np.fmax.at(widest, look, radius)
+    open_only = np.bincount(look, ~least, minlength=n) == 0
+    h, h_sigma = merged.height_m.copy(), merged.sigma_m.copy()
+    for k in np.flatnonzero(np.bincount(look, least, minlength=n) > 0):
+        mine = look == k
+        if open_only[k]:
+            best = np.flatnonzero(mine)[np.argmax(height[mine])]
+            h[k], h_sigma[k] = height[best], sigma[best]
+        else:
+            closed = mine & ~least
+            mean, error = _weighted(
+                height[closed], sigma[closed], np.zeros(closed.sum(), np.int64), 1,
+                np.array([closed.sum()]),
+            )  # fmt: skip
+            h[k], h_sigma[k] = mean[0], error[0]
+    return replace(
+        merged, height_m=h, sigma_m=h_sigma, least=open_only,
+        radius_m=np.where(np.isfinite(widest), widest, np.nan),
+    )  # fmt: skip
+
+
+def _optional(tables: Sequence[Looks], name: str, kind: type) -> npt.NDArray[Any]:
+    """Return a column that a table of looks may lack; zeros there."""
+    parts: list[npt.NDArray[Any]] = [
+        np.asarray(getattr(t, name, np.zeros(len(t.height_m))), kind) for t in tables
+    ]
+    return np.concatenate(parts) if parts else np.zeros(0, kind)
+
+
+def _radius(tables: Sequence[Looks]) -> FloatArray:
+    """Return the greater half size of each look's footprint; NaN where none is told."""
+    half = np.maximum(
+        _optional(tables, "half_across_m", float), _optional(tables, "half_along_m", float)
+    )
+    return np.where(half > 0, half, np.nan)
 
 
 def _weighted(
@@ -181,5 +237,7 @@ def write_objects(path: Path, objects: MergedObjects, crs: str) -> None:
         "looks": objects.looks.astype(np.int32),
         "passes": objects.passes.astype(np.int32),
         "disputed": objects.disputed,
+        "radius_m": objects.radius_m,
+        "bound": np.where(objects.least, "lower", "").astype(object),
     }
     write_layer(path, points, columns, crs, "Point")

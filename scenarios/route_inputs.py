@@ -189,7 +189,8 @@ def _tell_of_sigma(given: Given, grid: Grid, limits: VehicleLimits) -> None:
     if not known and limits.sigma_depth_m == 0 and limits.sigma_position_m == 0:
         logger.warning(
             "%s: has no sigma, so the clearance holds over the raster as it stands (k = 0); "
-            "give --map-sigma to cover the map's errors", given.map_path,
+            "give --map-sigma to cover the map's errors%s", given.map_path,
+            "" if given.objects is None else " and the objects'",
         )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -173,7 +174,7 @@ def a_table(rows: list[tuple[float, float, str, float, float]], which: int) -> O
     )  # fmt: skip
 
 
-def test_looks_at_one_object_become_one_and_contradictions_stay_apart(tmp_path: object) -> None:
+def test_looks_at_one_object_become_one_and_contradictions_stay_apart(tmp_path: Path) -> None:
     tables = [
         a_table([(0, 0, "hill", 1.0, 0.1), (50, 0, "crater", 0.5, 0.1)], 0),
         a_table([(1, 0, "hill", 1.2, 0.2), (50, 1, "hill", 0.5, 0.1)], 1),
@@ -187,11 +188,34 @@ def test_looks_at_one_object_become_one_and_contradictions_stay_apart(tmp_path: 
     assert merged.height_m[first] == pytest.approx(weights @ [1.0, 1.2, 1.1] / 225.0)
     assert merged.disputed.sum() == 2
     assert np.allclose(merged.easting_m[merged.disputed], 50.0)
-    from pathlib import Path
 
-    path = Path(str(tmp_path)) / "objects.gpkg"
+    path = tmp_path / "objects.gpkg"
     write_objects(path, merged, CRS)
     assert path.stat().st_size > 0
+
+
+def test_a_least_height_yields_to_a_closed_look_and_is_told_where_there_is_none(
+    tmp_path: Path,
+) -> None:
+    """An open shadow proves 1 m; another pass measures 3 m. A second object has open shadows alone."""
+    from mapping.object_layer import read_objects
+    from perception.records import Grid
+
+    opened = replace(
+        a_table([(0, 0, "hill", 1.0, 0.1), (60, 0, "hill", 2.0, 0.2)], 0),
+        lower_bound=np.array([True, True]), half_across_m=np.array([1.5, 2.5]),
+    )  # fmt: skip
+    closed = a_table([(1, 0, "hill", 3.0, 0.1)], 1)
+    again = replace(a_table([(60, 1, "hill", 2.5, 0.2)], 2), lower_bound=np.array([True]))
+    merged = merge_objects([opened, closed, again])
+    assert len(merged) == 2 and not merged.disputed.any()
+    write_objects(tmp_path / "objects.gpkg", merged, CRS)
+    grid = Grid(np.zeros((4, 4)), -2.0, 2.0, 0.5, crs=CRS)
+    found = read_objects(tmp_path / "objects.gpkg", grid)
+    order = np.argsort(found.easting_m)
+    np.testing.assert_allclose(found.height_m[order], [3.0, 2.5])
+    assert found.least[order].tolist() == [False, True]
+    np.testing.assert_allclose(found.radius_m[order], [1.5, 2.5])
 
 
 def test_two_objects_of_one_pass_never_merge() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapping.object_layer import ObjectLayer, read_objects
-from perception.records import Grid
+from perception.records import Grid, InputError
 from planning.limits import VehicleLimits
 from planning.obstacles import obstacles_on
 from planning.planner import PlanConfig, solve
@@ -126,6 +126,13 @@ def test_ground_under_an_object_of_unknown_height_bars_a_route(grid: Grid) -> No
     barred = Problem(grid, obstacles=found).surface(None, 0.0).barred
     assert barred[found.barred].all()
     assert found.barred.any() and not found.barred.all()
+
+
+def test_an_object_without_a_place_is_refused_by_its_number(tmp_path: Path, grid: Grid) -> None:
+    path = tmp_path / "objects.csv"
+    path.write_text("easting_m,northing_m,kind,height_m\n10,20,hill,2.5\n,,hill,2\n")
+    with pytest.raises(InputError, match="object 2 of 2 has no position"):
+        read_objects(path, grid)
 
 
 def test_a_list_tells_craters_sigmas_and_least_heights(tmp_path: Path, grid: Grid) -> None:
