@@ -10,8 +10,9 @@ import numpy as np
 from mapping.compare import Difference, difference
 from perception.records import FloatArray, Grid
 
-# Blocks a side into which the common ground is cut, coarse to fine, to see how far errors reach.
-_BLOCKS = (2, 4, 8)
+# Blocks (north-south, east-west) into which the common ground is cut to see how far errors reach: squares, and bands,
+# for what one pass got wrong reaches along all of it and no further.
+_BLOCKS = ((2, 2), (4, 4), (8, 8), (4, 1), (8, 1), (1, 4), (1, 8))
 # A block counts that holds this part of what a full one would.
 _LEAST_PART = 0.2
 
@@ -75,19 +76,24 @@ def sigma_of_median(values: FloatArray) -> float:
     middle = np.median(values[known])
     whole = 1.4826 * float(np.median(np.abs(values[known] - middle)))
     rows, cols = (slice(int(v.min()), int(v.max()) + 1) for v in np.nonzero(known))
-    found = [s for s in (_by_blocks(values[rows, cols], n) for n in _BLOCKS) if s is not None]
+    found = [s for s in (_by_blocks(values[rows, cols], *n) for n in _BLOCKS) if s is not None]
     return max(found) if found else whole
 
 
-def _by_blocks(values: FloatArray, number: int) -> float | None:
-    """Return the standard error of the mean of the medians of `number` squared blocks; None of fewer than four."""
+def _by_blocks(values: FloatArray, down: int, across: int) -> float | None:
+    """Return the standard error of the mean of the medians of `down` x `across` blocks; None of fewer than four.
+
+    The scatter of m blocks is itself uncertain: Student's t with m - 1 degrees of freedom has the variance
+    (m - 1) / (m - 3).
+    """
     blocks = [
         block[np.isfinite(block)]
-        for band in np.array_split(values, number, axis=0)
-        for block in np.array_split(band, number, axis=1)
+        for band in np.array_split(values, down, axis=0)
+        for block in np.array_split(band, across, axis=1)
     ]
-    least = max(_LEAST_PART * np.isfinite(values).sum() / number**2, 4)
+    least = max(_LEAST_PART * np.isfinite(values).sum() / (down * across), 4)
     medians = [float(np.median(block)) for block in blocks if len(block) >= least]
     if len(medians) < 4:
         return None
-    return float(np.std(medians, ddof=1) / np.sqrt(len(medians)))
+    m = len(medians)
+    return float(np.std(medians, ddof=1) * np.sqrt((m - 1) / (m - 3) / m))

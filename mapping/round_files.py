@@ -8,7 +8,9 @@ from pathlib import Path
 from mapping.survey import Round
 from perception.files import write_text
 
-_HEADER = "round,floor,square_m,compared,accepted,used,evidence,moved_m,error_before,error_after"
+_HEADER = (
+    "round,floor,square_m,compared,accepted,used,beyond,evidence,moved_m,error_before,error_after"
+)
 
 
 def write_rounds(path: Path, rounds: Sequence[Round]) -> None:

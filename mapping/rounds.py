@@ -66,6 +66,7 @@ def register(
     floor: Grid | None,
     progress: Progress,
     label: str,
+    expected: FloatArray | None = None,
 ) -> tuple[list[tuple[Window, Match]], list[Link]]:
     """Compare the passes over every window; return every comparison, and a link for each accepted one.
 
@@ -73,17 +74,19 @@ def register(
     ----------
     corrected : the strips on the track of `solution`.
     floor : a map that tells where echoes came from; None what the strips' soundings say of it.
+    expected : (windows, 2, 2) covariance of the shift expected beforehand; None what `expected_shift` says.
     """
+    if expected is None:
+        expected = np.array(
+            [expected_shift(keyframes, solution, *ends_of(keyframes, w), graph) for w in windows]
+        )
     known = known_floor(corrected) if floor is None else floor
     needed = sorted({index for w in windows for index in (w.first, w.second)})
     with ThreadPoolExecutor(_THREADS) as pool:
         made = pool.map(lambda index: textures.placed(index, corrected[index], known), needed)
         placed = dict(zip(needed, made, strict=True))
 
-    def compare(window: Window) -> Match:
-        first = keyframes.nearest(window.first, window.first_line)
-        second = keyframes.nearest(window.second, window.second_line)
-        prior = expected_shift(keyframes, solution, first, second, graph)
+    def compare(window: Window, prior: FloatArray) -> Match:
         search_m = 3.0 * float(np.sqrt(np.linalg.eigvalsh(prior).max())) + 2.0 * cell_m
         return match(
             placed[window.first],
@@ -99,7 +102,7 @@ def register(
     results: list[tuple[Window, Match]] = []
     # Transforms and gridding let go of the interpreter's lock; the order of results is that of the windows.
     with ThreadPoolExecutor(_THREADS) as pool:
-        for window, result in zip(windows, pool.map(compare, windows), strict=True):
+        for window, result in zip(windows, pool.map(compare, windows, expected), strict=True):
             results.append((window, result))
             progress(label, len(results), len(windows))
     results = [(w, m) for (w, _), m in zip(results, believed([m for _, m in results]), strict=True)]
@@ -109,6 +112,14 @@ def register(
         if result.accepted
     ]
     return results, links
+
+
+def ends_of(keyframes: Keyframes, window: Window) -> tuple[int, int]:
+    """Return the keyframes nearest to where the two passes of a window saw it."""
+    return (
+        keyframes.nearest(window.first, window.first_line),
+        keyframes.nearest(window.second, window.second_line),
+    )
 
 
 def known_floor(strips: Sequence[ElevationStrip]) -> Grid | None:

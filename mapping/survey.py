@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,12 +16,14 @@ from mapping.link_choice import apart, enough
 from mapping.overlaps import Window, find_overlaps
 from mapping.placing import at_lines, bridge, on_track
 from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, solve
+from mapping.pose_graph_relative import relative_covariance
 from mapping.prior_tie import ties_to_prior
-from mapping.rounds import Registration, TextureStore, register
+from mapping.rounds import Registration, TextureStore, ends_of, register
 from mapping.sharing import solve_shared
 from mapping.survey_check import check, least_square_m, square_cell_m, swath_width
 from mapping.textures import MatchConfig, default_cell, thinned
 from perception.records import (
+    BoolArray,
     ElevationStrip,
     FloatArray,
     Grid,
@@ -66,6 +68,7 @@ class Round:
     floor : what told where echoes came from: "soundings" or "map".
     square_m : width of the compared squares.
     compared, accepted, used : comparisons made, accepted by themselves, believed by the graph.
+    beyond : squares left for later, their shift expected wider than any search.
     evidence : mean log-likelihood ratio of a comparison against no match, refused ones included.
     moved_m : rms by which the track still moved.
     error_before, error_after : the graph's error (half a chi-square).
@@ -76,6 +79,7 @@ class Round:
     compared: int
     accepted: int
     used: int
+    beyond: int
     evidence: float
     moved_m: float
     error_before: float
@@ -130,6 +134,12 @@ class CorrectedSurvey:
     squares: tuple[Window, ...] = ()
 
 
+# Rounds of one square's width beyond the first, where passes come within reach one after the other.
+_MORE_ROUNDS = 3
+
+_Factor = TypeVar("_Factor")
+
+
 @dataclass(frozen=True, slots=True)
 class _Given:
     """What stays the same through the rounds; `thin` are the strips on the columns of the comparison."""
@@ -153,6 +163,7 @@ class _State:
     rounds: tuple[Round, ...] = ()
     found: tuple[Registration, ...] = ()
     pool: tuple[tuple[Window, Link], ...] = ()
+    links: tuple[Link, ...] = ()
     steps: tuple[HeightStep, ...] = ()
 
 
@@ -197,19 +208,32 @@ def correct_survey(
         squares = config.squares[-1:]
         state = _State(
             known.solution, known.diagnostics.rounds, known.registrations,
-            tuple(zip(known.squares, known.links, strict=True)), known.steps,
+            tuple(zip(known.squares, known.links, strict=True)),
+            _trusted(known.links, known.solution.link_used),
+            _trusted(known.steps, known.solution.step_used),
         )  # fmt: skip
     settled_m = config.settled_m or 0.2 * cell_m
     for number in range(config.rounds or len(squares)):
         last = number >= len(squares) - 1
-        state = _round(given, state, squares[min(number, len(squares) - 1)], last, known)
+        part = squares[min(number, len(squares) - 1)]
+        state = _round(given, state, part, last, known)
+        for _ in range(_MORE_ROUNDS):
+            before = state.rounds[-1].beyond
+            if not before or not state.found:
+                break
+            # Nearer passes are tied now: farther ones have come within reach of a search.
+            state = _round(given, state, part, last, known)
+            if state.rounds[-1].beyond > 0.9 * before:
+                break
         if not state.found or (number >= len(squares) and state.rounds[-1].moved_m < settled_m):
             break
     chosen = apart(state.pool)
     links = [link for _, link in chosen]
-    solution = state.solution
-    if links:
+    if links or state.rounds:
+        # Without links too: where the graph refused every one, the last round's solution still names them.
         solution = solve_shared(keyframes, links, ties, config.graph, state.steps)
+    else:
+        solution = state.solution
     return assemble(
         strips, keyframes, solution, state.found, links, [w for w, _ in chosen], ties, state.steps,
         state.rounds, config,
@@ -223,11 +247,14 @@ def _round(
     config, keyframes = given.config, given.keyframes
     side_m = max(part * given.width_m, least_square_m(given.cell_m))
     corrected = on_track(given.thin, keyframes, state.solution)
+    every = find_overlaps(corrected, side_m)
+    reached, expected = _within_reach(given, state, every)
+    windows = _worth_comparing(reached, state, len(keyframes), last, known)
     results, links = register(
-        corrected, given.textures, keyframes, state.solution,
-        _worth_comparing(find_overlaps(corrected, side_m), state, len(keyframes), last, known),
+        corrected, given.textures, keyframes, state.solution, windows,
         square_cell_m(side_m, given.cell_m), config.match, config.graph, config.widest_search_m,
         given.floor, given.progress, f"registering, round {len(state.rounds) + 1}",
+        np.array([expected[_place(w)] for w in windows]),
     )  # fmt: skip
     steps = height_steps(corrected, keyframes, state.solution, links)
     after = solve(keyframes, links, given.ties, config.graph, steps=steps)
@@ -240,6 +267,7 @@ def _round(
         compared=len(found),
         accepted=len(links),
         used=sum(r.used for r in found),
+        beyond=len(every) - len(reached),
         evidence=float(np.mean([r.match.evidence for r in found])) if found else 0.0,
         moved_m=float(np.sqrt((moved**2).sum(axis=1).mean())),
         error_before=after.error_before,
@@ -247,12 +275,59 @@ def _round(
     )
     logger.info("round %d: %s", len(state.rounds) + 1, said)
     believed_here = zip((r.window for r in found if r.match.accepted), links, strict=True)
-    kept = tuple(x for x, ok in zip(believed_here, after.link_used, strict=True) if ok)
-    return _State(after, (*state.rounds, said), found, (*state.pool, *kept), tuple(steps))
+    kept = _trusted(tuple(believed_here), after.link_used)
+    return _State(
+        after, (*state.rounds, said), found, (*state.pool, *kept), tuple(x for _, x in kept),
+        _trusted(steps, after.step_used),
+    )  # fmt: skip
+
+
+def _trusted(factors: Sequence[_Factor], used: BoolArray) -> tuple[_Factor, ...]:
+    return tuple(x for x, ok in zip(factors, used, strict=True) if ok)
+
+
+# The model of the drift is a guess: shifts are expected to be so much wider than it says.
+_CAUTION = 1.5
+
+
+def _within_reach(
+    given: _Given, state: _State, windows: Sequence[Window]
+) -> tuple[tuple[Window, ...], dict[tuple[int, int, float, float], FloatArray]]:
+    """Return the windows whose true shift the widest search holds, and the shift's covariance beforehand.
+
+    A search that the truth may lie outside of finds something else. Those windows wait for a later round, when
+    registrations of nearer passes have narrowed what is expected. Of passes that no navigation joins, or one that
+    jumps, the graph expects nothing, though most begin with a fix of their own: they are searched as far as
+    the search goes.
+    """
+    ties = _trusted(given.ties, state.solution.fix_used)
+    pairs = np.array([ends_of(given.keyframes, w) for w in windows], np.int64).reshape(-1, 2)
+    relative = relative_covariance(
+        given.keyframes, state.solution, state.links, ties, state.steps, pairs
+    )
+    expected = _CAUTION**2 * relative + _LEAST_SHIFT_M**2 * np.eye(2)
+    unknown = ~np.isfinite(expected).all(axis=(1, 2))
+    expected[unknown] = given.config.widest_search_m**2 * np.eye(2)
+    joined = np.isfinite(given.keyframes.way_m) & ~(given.keyframes.jump_m > 0)
+    dive = np.cumsum(~joined)
+    separate = dive[pairs[:, 0]] != dive[pairs[:, 1]]
+    narrow = 2.0 * np.sqrt(np.linalg.eigvalsh(expected)[:, -1]) <= given.config.widest_search_m
+    reached = narrow | separate | unknown
+    return _trusted(windows, reached), {
+        _place(w): covariance for w, covariance in zip(windows, expected, strict=True)
+    }
+
+
+# Beneath what the graph can know: beams, rocking, the floor that places echoes. [m]
+_LEAST_SHIFT_M = 0.5
 
 
 def _worth_comparing(
-    windows: list[Window], state: _State, keyframes: int, last: bool, known: CorrectedSurvey | None
+    windows: Sequence[Window],
+    state: _State,
+    keyframes: int,
+    last: bool,
+    known: CorrectedSurvey | None,
 ) -> list[Window]:
     """Return the windows to compare: fewer where they only narrow the next round's search."""
     if known is None:

@@ -28,6 +28,18 @@ def test_the_sigma_of_the_tie_is_that_of_its_error(reach: float) -> None:
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 
+def test_errors_that_follow_the_passes_count_as_many_times_as_there_are_passes() -> None:
+    """Six bands with an offset each: few errors are beyond two sigmas, and sigma is no wild guess."""
+    rng = np.random.default_rng(6)
+    ratios = []
+    for _ in range(60):
+        offsets = np.repeat(0.2 * rng.normal(size=6), 30)[:, None] * np.ones(200)
+        field = offsets + errors(rng, 3.0, (180, 200)) * 0.3
+        ratios.append(np.median(field) / sigma_of_median(field))
+    assert (np.abs(ratios) > 2).mean() < 0.15
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
 def test_a_shift_comes_back_and_every_cell_bears_its_sigma() -> None:
     rng = np.random.default_rng(4)
     ground = errors(rng, 10.0) * 10 - 30.0

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mapping import survey
 from mapping.fixes import PositionFix
 from mapping.pose_graph import GraphConfig
+from mapping.pose_graph_files import write_graph
 from mapping.survey import SurveyConfig, correct_survey
 from perception.records import InputError
 from tests.mapping.worlds import Drift, Flight, fly, make_world
@@ -73,6 +76,35 @@ def test_passes_that_never_meet_stay_on_their_navigation() -> None:
     assert corrected.registrations == ()
     for f, strip in zip(flown, corrected.strips, strict=True):
         np.testing.assert_allclose(strip.easting_m, f.strip.easting_m, atol=1e-6)
+
+
+def test_a_survey_whose_every_match_is_refused_is_whole_and_can_be_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Each round one chance match, sixty metres off: the graph refuses it, and no link is left."""
+    plain = survey.register
+
+    def spoilt(*given: object, **more: object) -> object:
+        results, links = plain(*given, **more)  # type: ignore[arg-type]
+        results = [(w, replace(m, accepted=i == 0)) for i, (w, m) in enumerate(results)]
+        wrong = [
+            replace(x, shift_m=x.shift_m + 60.0, covariance_m2=0.01 * np.eye(2)) for x in links[:1]
+        ]
+        return (
+            (results, wrong)
+            if wrong
+            else ([(w, replace(m, accepted=False)) for w, m in results], [])
+        )
+
+    monkeypatch.setattr(survey, "register", spoilt)
+    rng = np.random.default_rng(2)
+    legs = [(60.0, 20.0, 0.0, 120.0), (20.0, 80.0, 90.0, 120.0)]
+    flown = fly(make_world(rng, size=200), legs, rng, Drift(0.0, 0.0, 0.0), turn_m=200.0)
+    config = SurveyConfig(graph=GraphConfig(drift_m_per_sqrt_km=2.0))
+    corrected = correct_survey([f.strip for f in flown], config=config)
+    assert sum(r.accepted for r in corrected.diagnostics.rounds) > 0
+    assert len(corrected.links) == len(corrected.solution.link_used) == 0
+    write_graph(tmp_path, corrected)
 
 
 def test_a_strip_wholly_nan_harms_no_other(flown: list[Flight]) -> None:
