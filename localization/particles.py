@@ -230,7 +230,11 @@ def weigh(  # type: ignore[no-untyped-def]
     rows, cols = heights.shape
     flat = heights.ravel()
     per_e, per_n = 1.0 / frame[2], 1.0 / frame[3]
-    top_col, top_row, width = np.float32(cols - 1.001), np.float32(rows - 1.001), np.int32(cols)
+    # From 32,768 cells on, single precision rounds 1.001 cells from the end to the last one itself.
+    last_col, last_row = np.float32(cols - 1), np.float32(rows - 1)
+    top_col = min(np.float32(cols - 1.001), np.nextafter(last_col, zero))
+    top_row = min(np.float32(rows - 1.001), np.nextafter(last_row, zero))
+    width = np.int32(cols)
     col_0, row_0, twist, m, v, total, scale = work
     for i in range(east.size):
         col_0[i], row_0[i], twist[i] = east[i] * per_e, north[i] * per_n, turn[i]

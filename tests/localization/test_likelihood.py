@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import navsets
 import numpy as np
+import pytest
 
 from localization.likelihood import bias_marginal, sounding_noise
 from localization.measurements import Beam, beam_vectors, default_beams, soundings_of
@@ -112,3 +113,20 @@ def test_a_pitched_beam_lands_ahead_and_a_rolled_one_to_port() -> None:
     # Bow up tilts the belly's normal ahead; starboard down tilts it to port (west on heading north).
     assert (body_axes(0.0, 0.1, 0.0) @ down)[1] > 0.09
     assert (body_axes(0.0, 0.0, 0.1) @ down)[0] < -0.09
+
+
+@pytest.mark.parametrize("columns", [100, 40_000])
+def test_a_sounding_on_the_last_cell_meets_no_map_however_wide_the_map_is(columns: int) -> None:
+    """Between the last cell and the one after it there is nothing to read: memory ends there."""
+    heights = np.zeros((2, columns), np.float32)
+    single = np.zeros((4, 1))
+    work, log_weight = np.empty((7, 1), np.float32), np.zeros(1)
+    fitting = [
+        weigh(
+            heights, np.array([0.0, 0.0, 1.0, 1.0]), single[0], single[1], single[2], single[3],
+            np.ones(1), log_weight, float(at), -0.5, np.zeros(1), np.zeros(1), np.zeros(1),
+            np.ones(1), 0.0, work,
+        )[1]
+        for at in (columns - 1.5, columns - 1)
+    ]  # fmt: skip
+    assert fitting == [1, 0]
