@@ -124,13 +124,14 @@ def pictured(contacts: Sequence[Contact], most: int = _MOST) -> list[Contact]:
 
 def moved(contacts: Sequence[Contact], table: ObjectTable) -> list[Contact]:
     """Return a pass's contacts where its objects lie in `table`, the same objects on a corrected track."""
+    # Port and starboard of one ping may have the same kind at the same sample.
     rows = {
-        (int(ping), float(range_m), kind): k
-        for k, (ping, range_m, kind) in enumerate(
-            zip(table.ping, table.slant_range_m, table.kind, strict=True)
+        (int(ping), float(range_m), kind, bool(across_m > 0)): k
+        for k, (ping, range_m, kind, across_m) in enumerate(
+            zip(table.ping, table.slant_range_m, table.kind, table.across_m, strict=True)
         )
     }
-    at = [rows[c.ping, c.slant_range_m, c.kind] for c in contacts]
+    at = [rows[c.ping, c.slant_range_m, c.kind, c.across_m > 0] for c in contacts]
     return [
         replace(c, easting_m=float(table.easting_m[k]), northing_m=float(table.northing_m[k]))
         for c, k in zip(contacts, at, strict=True)
@@ -222,7 +223,10 @@ def _short(crs: str) -> str:
 
 
 def _card(number: int, contact: Contact, place: str, disputed: bool) -> str:
-    picture = base64.b64encode(contact.snippet).decode("ascii")
+    picture = ""
+    if contact.snippet:
+        data = base64.b64encode(contact.snippet).decode("ascii")
+        picture = f'<img alt="echo of contact {number}" src="data:image/png;base64,{data}">'
     what = "height" if contact.kind == "hill" else "depth"
     least = "at least " if contact.lower_bound else ""
     mark = '<b class="mark">disputed: another pass saw the other kind</b>' if disputed else ""
@@ -240,7 +244,7 @@ def _card(number: int, contact: Contact, place: str, disputed: bool) -> str:
     of = f" of {1 + len(contact.parts)} parts" if contact.parts else ""
     lines = "".join(f"<dt>{name}</dt><dd>{value}</dd>" for name, value in rows if value)
     return (
-        f'<article><img alt="echo of contact {number}" src="data:image/png;base64,{picture}">'
+        f"<article>{picture}"
         f"<div><h2>{number}. {contact.kind}{of}</h2>{mark}<dl>{lines}</dl></div></article>"
     )
 

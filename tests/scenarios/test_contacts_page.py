@@ -11,7 +11,7 @@ import numpy as np
 
 from perception.object_table import ObjectRow, ObjectTable
 from perception.strips import build_strip
-from scenarios.report.contacts import contacts_of, pictured, touching, write_contacts
+from scenarios.report.contacts import contacts_of, moved, pictured, touching, write_contacts
 from tests.perception.echo_fixtures import Survey, box, make_swath
 
 CRS = "EPSG:32619"
@@ -86,3 +86,26 @@ def test_a_contact_is_told_by_its_highest_part_and_names_the_others(tmp_path: Pa
     write_contacts(tmp_path / "contacts.html", contacts, "survey.xtf", CRS)
     page = (tmp_path / "contacts.html").read_text()
     assert "hill of 2 parts" in page and page.count("<dt>part</dt>") == 1
+
+
+def test_a_contact_whose_picture_was_let_go_has_none_on_the_page(tmp_path: Path) -> None:
+    swath = make_swath(
+        box(1.0, 15, 10, 0.8, 0.8), Survey(n_pings=80, n_samples=500), np.random.default_rng(5)
+    )
+    contact = contacts_of(build_strip(swath))[0]
+    bare = replace(contact, snippet=b"", probability=0.2)
+    write_contacts(tmp_path / "contacts.html", [contact, bare], "survey.xtf", CRS)
+    page = (tmp_path / "contacts.html").read_text()
+    assert page.count("<article>") == 2 and page.count("<img") == 1 and 'base64,"' not in page
+
+
+def test_two_objects_of_one_ping_at_one_range_move_each_to_its_own_side() -> None:
+    swath = make_swath(
+        box(1.0, 15, 10, 0.8, 0.8), Survey(n_pings=80, n_samples=500), np.random.default_rng(5)
+    )
+    contact = contacts_of(build_strip(swath))[0]
+    sides = [replace(contact, ping=0, slant_range_m=22.0, kind="hill", across_m=x)
+             for x in (20.0, -20.0)]  # fmt: skip
+    table = ObjectTable.of([_row(20, 50, 22, 4), _row(-20, 50, 22, 4)])
+    there = replace(table, easting_m=np.array([120.0, 80.0]))
+    assert [look.easting_m for look in moved(sides, there)] == [120.0, 80.0]
