@@ -11,6 +11,7 @@ import json
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -26,6 +27,8 @@ from perception.strips import PassResult, StripConfig, build_strip
 from scenarios.passes import each_pass
 from scenarios.report.contacts import Contact, contacts_of, pictured
 
+# Part of every pass's key: raise it when the same echoes would give another strip, objects or contacts.
+_METHOD = 1
 # Registration compares strips on this part of its cell; finer columns stay on disk.
 _THIN = 0.6
 # As in `scenarios.survey_map`.
@@ -70,7 +73,7 @@ def file_passes(
     """
 
     def key_of(index: int) -> str:
-        text = repr((identity, config, index))
+        text = repr((_METHOD, identity, config, index))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def path_of(index: int) -> Path:
@@ -107,7 +110,8 @@ def _taken_up(path: Path, key: str) -> FiledPass | None:
         if said["key"] != key or StripFile.of(path).digest != said["digest"]:
             return None
         objects, contacts = _read_objects(path.with_suffix(".objects.npz"))
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
+        # Cut short, or with other columns than this version's: made anew like one that is not there.
         return None
     return _filed(StripFile(path, said["digest"]), read_strip(path), objects, contacts)
 
