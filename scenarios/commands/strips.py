@@ -68,7 +68,6 @@ def command(
 
     set_verbosity(quiet, verbose)
     prepare_out(out)
-    _clear(out)
     given = None if bottom is None else read_bottom(bottom)
     # The mission's map reuses strips made with the default settings, which are told by None.
     config = (
@@ -80,6 +79,8 @@ def command(
         if not quiet:
             for warning in survey.warnings:
                 click.echo(f"note: {warning}", err=True)
+        # Not before all inputs are read: a mistyped name must not cost the strips that are there.
+        _clear(out)
         metrics = _write_passes(out, survey, config, _title(surveys), progress)
     settings = {"surveys": [str(p) for p in surveys], "crs": survey.crs, "cell_m": cell}
     write_metrics(out, metrics, {**settings, "bottom": bottom})

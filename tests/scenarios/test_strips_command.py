@@ -81,6 +81,20 @@ def test_a_second_run_starts_clean_and_says_nothing_when_quiet(
     assert np.diff(read_strip(out / "strip-000.nc").across_m) == pytest.approx(0.5)
 
 
+def test_inputs_that_cannot_be_read_cost_no_strips_that_are_there(
+    survey: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "strips"
+    out.mkdir()
+    (out / "strip-000.nc").write_bytes(b"of the last good run")
+    for wrong in (
+        (tmp_path / "survye.nc",), (survey, "--bottom", tmp_path / "none.csv"),
+        (survey, "--install", tmp_path / "none.toml"),
+    ):  # fmt: skip
+        assert _run(*wrong, "--out", out).returncode == 1
+        assert (out / "strip-000.nc").read_bytes() == b"of the last good run"
+
+
 @pytest.mark.parametrize(
     "content, word", [(None, "no such file"), (b"", "is empty"), (b"\x07" * 4000, "")]
 )
