@@ -148,8 +148,10 @@ def predict(ray, law, height, angle, slant, last, begin, energy, predicted):
 
 @njit(cache=True, nogil=True)
 def between(running, a, b):
-    """Return what a running sum gained between two fractional places."""
-    i, j = int(a), int(b)
+    """Return what a running sum gained between two fractional places, up to its last."""
+    # A range just short of the last sample's end may round to that end, behind which nothing is stored.
+    most = len(running) - 2
+    i, j = min(int(a), most), min(int(b), most)
     return (running[j] + (b - j) * (running[j + 1] - running[j])
             - running[i] - (a - i) * (running[i + 1] - running[i]))  # fmt: skip
 

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from perception import bands
+from perception.facets import between
 from perception.rays import Rays
 from perception.shading import Rows, trace
 
@@ -68,3 +69,11 @@ def test_tracing_does_not_depend_on_the_number_of_threads(monkeypatch: pytest.Mo
     assert np.array_equal(passed, also)
     for name in ("cell", "c_east", "c_level", "ratio", "look"):
         assert np.array_equal(getattr(one, name), getattr(three, name))
+
+
+def test_a_running_sum_is_read_up_to_its_last_place_and_not_beyond() -> None:
+    """A range just short of the swath's end, over the width of a sample, may round to the number of samples."""
+    stored = np.array([0.0, 1.0, 3.0, 6.0, 10.0, np.nan])
+    running = stored[:5]
+    assert between(running, 2.5, 4.0) == 5.5
+    assert between(running, 3.0, 4.0) == 4.0
