@@ -3,6 +3,9 @@
 The founding paper: returns of different objects that arrive together are ambiguous, but only from one place; as the
 vehicle moves the same two are told apart. A wall that faces the sonar is as near as the floor in front of it, so
 its echo and the floor's share a range (layover); from the other side, or from farther off, the floor is seen alone.
+
+Strips flag such cells by `layover_cells`. `candidates` and `settled` are for callers who combine looks themselves: no
+stage of bathynav calls them, and a map weighs its looks by their sigma alone.
 """
 
 from __future__ import annotations
