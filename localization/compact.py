@@ -20,13 +20,16 @@ from localization.correlation import Matching, match_patch
 from localization.landmarks import Landmarks, find_landmarks
 from localization.refinement import Match, verify
 from localization.rescaled import cells_of, in_cells, without_white_error
-from perception.records import FloatArray, Grid, IntArray
+from perception.records import FloatArray, Grid, IntArray, Progress, silent
 
 # Cells of the map in one of the thumbnail: 49 cells of four bytes to one byte is half of a hundredth.
 _WIDE = 7
 _LEVELS = 254
 # Evidence on the thumbnail by which the landmarks' place may fall behind the thumbnail's own.
 _BEHIND = 6.0
+# Where the thumbnail knows nothing of that place, by how much more than is asked of them otherwise the
+# landmarks must be sure: as much again as their bar over chance.
+_UNCHECKED = 8.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,14 +107,16 @@ class CompactMatch:
     reason: str
 
 
-def match_compact(carried: CompactMap, patch: Grid, turn_rad: float | None = None) -> CompactMatch:
+def match_compact(
+    carried: CompactMap, patch: Grid, turn_rad: float | None = None, progress: Progress = silent
+) -> CompactMatch:
     """Place a patch, its coordinates counted from its centre, on a compact map."""
     marks = Constellation(Landmarks.unpacked(carried.landmarks)).match(
         find_landmarks(in_cells(patch, carried.fine_m)), turn_rad
     )
     wide = in_cells(patch, carried.cell_m).elevation_m
     heights = carried.heights()
-    thumb = match_patch(heights, wide, turn_rad)
+    thumb = match_patch(heights, wide, turn_rad, progress=progress)
     named = f"thumbnail: {thumb.reason}; landmarks: {marks.reason}"
     if not marks.hypotheses or not marks.accepted:
         best = thumb.best if thumb.hypotheses else None
@@ -123,7 +128,11 @@ def match_compact(carried: CompactMap, patch: Grid, turn_rad: float | None = Non
         return CompactMatch(thumb, marks, thumb.best, False, f"the two disagree: {named}")
     # The landmarks are sure: the thumbnail, which is not, must at least not know a better place.
     tried = verify(heights, wide, _match_of(carried, place), free_turn=turn_rad is None)
-    stands = tried.evidence > thumb.best.evidence - _BEHIND
+    if tried.evidence > 0:
+        stands = tried.evidence > thumb.best.evidence - _BEHIND
+        return CompactMatch(thumb, marks, place, stands, named)
+    stands = marks.surplus >= _UNCHECKED
+    named = f"not checked on the thumbnail, {marks.surplus:.1f} above the bar, {_UNCHECKED:g} needed: {named}"
     return CompactMatch(thumb, marks, place, stands, named)
 
 

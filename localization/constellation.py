@@ -61,11 +61,12 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class ConstellationMatch:
-    """Hypotheses, best first; whether the best may be used, and why."""
+    """Hypotheses, best first; whether the best may be used, and why; by how much it passed the narrower bar."""
 
     hypotheses: tuple[Placement, ...]
     accepted: bool
     reason: str
+    surplus: float = 0.0
 
 
 class Constellation:
@@ -273,12 +274,14 @@ class Constellation:
         best = kept[0]
         margin = best.score - kept[1].score if len(kept) > 1 else np.inf
         where = f"{best.matched} of {len(patch)} landmarks, log likelihood ratio {best.score:.1f}"
-        if best.score < np.log(places) + _CHANCE:
-            reason = f"no better than chance: {where}, {np.log(places) + _CHANCE:.1f} needed"
+        bar = float(np.log(places)) + _CHANCE
+        if best.score < bar:
+            reason = f"no better than chance: {where}, {bar:.1f} needed"
         elif margin < _DISTINCT:
             reason = f"ambiguous: {where}, {margin:.1f} above the next place, {_DISTINCT:g} needed"
         else:
-            return ConstellationMatch(tuple(kept), True, where)
+            surplus = min(best.score - bar, margin - _DISTINCT)
+            return ConstellationMatch(tuple(kept), True, where, surplus)
         return ConstellationMatch(tuple(kept), False, reason)
 
 

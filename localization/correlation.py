@@ -15,11 +15,12 @@ import numpy as np
 from scipy import fft, ndimage
 
 from localization.refinement import LEAST_OVERLAP, Match, smoothed, verify
-from perception.records import FloatArray
+from perception.records import FloatArray, Progress, silent
 
 # Side of the map in the coarse search: rotation by rotation, 256 cells are enough to find peaks.
 _COARSE_SIDE = 300
-# A patch of fewer cells a side is searched at half of a cell.
+# A patch of fewer cells a side is searched at half of a cell, on a map no larger than the coarse one: on a
+# larger map that would be gigabytes, and such a patch is searched cell by cell.
 _FINE_SIDE = 24
 # Log likelihood ratio between best and second place: e^12 covers a million places tried.
 _DISTINCT = 12.0
@@ -106,6 +107,7 @@ def match_patch(
     turn_rad: float | None = 0.0,
     keep: int = 6,
     step_rad: float = np.radians(4.0),
+    progress: Progress = silent,
 ) -> Matching:
     """Find where a patch belongs in a map of the same cell size.
 
@@ -124,14 +126,14 @@ def match_patch(
     thin = float(max(1, round(max(values.shape) / _COARSE_SIDE))) if turn_rad is None else 1.0
     if min(patch.shape) < _FINE_SIDE:
         # Of few wide cells, half a cell beside the place no short wave fits any more.
-        thin = 0.5
+        thin = 0.5 if max(values.shape) <= _COARSE_SIDE else 1.0
     coarse_map, coarse_patch = _thinned(values, thin), _thinned(patch, thin)
     turns = (
         np.arange(0.0, 2 * np.pi - step_rad / 2, step_rad)
         if turn_rad is None
         else np.array([turn_rad])
     )
-    candidates = _candidates(coarse_map, coarse_patch, turns, thin, values.shape)
+    candidates = _candidates(coarse_map, coarse_patch, turns, thin, values.shape, progress)
     free = turn_rad is None
     found, verified = Matching((), False, "", 0.0), list[Match]()
     # Weak ground may hide the true place far down the coarse list: look there only if need be.
@@ -182,6 +184,7 @@ def _candidates(
     turns: FloatArray,
     thin: float,
     shape: tuple[int, ...],
+    progress: Progress = silent,
 ) -> list[Match]:
     """Return the places that fit best over all turns, in cells of the full map.
 
@@ -195,7 +198,8 @@ def _candidates(
     spectra = Spectra(fine, (side, side))
     least = LEAST_OVERLAP * float(np.isfinite(patch).sum())
     found: list[tuple[float, Match]] = []
-    for turn in turns:
+    for k, turn in enumerate(turns):
+        progress("headings tried", k, len(turns))
         turned = rotated(sharp, float(turn))
         ncc, common = masked_ncc(spectra, turned, least)
         told = -common * np.log1p(-(np.clip(ncc, 0.0, 0.999) ** 2))
@@ -210,6 +214,7 @@ def _candidates(
             found.append((float(told[i, j]), match))
             near = max(2, min(patch.shape) // 6)
             told[max(i - near, 0) : i + near + 1, max(j - near, 0) : j + near + 1] = 0.0
+    progress("headings tried", len(turns), len(turns))
     if not found:
         return [Match(0.0, 0.0, float(turns[0]), -1.0, np.full((3, 3), np.nan), np.nan)]
     found.sort(key=lambda f: -f[0])

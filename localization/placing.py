@@ -18,7 +18,7 @@ from localization.correlation import match_patch
 from localization.integrity import protection_level
 from localization.refinement import Match
 from localization.rescaled import cells_of, in_cells, without_white_error
-from perception.records import FloatArray, Grid, InputError
+from perception.records import FloatArray, Grid, InputError, Progress, silent
 
 # A patch of fewer known cells of the map's tells nothing.
 _FEWEST_CELLS = 200
@@ -73,8 +73,10 @@ class Placing:
         return float(1.0 - 1.0 / np.exp(above).sum())
 
 
-def place_on_raster(prior: Grid, patch: Grid, turn_rad: float | None = None) -> Placing:
-    """Place a patch on the map's raster, over all headings or at the one given.
+def place_on_raster(
+    prior: Grid, patch: Grid, turn_rad: float | None = None, progress: Progress = silent
+) -> Placing:
+    """Place a patch on the map's raster, over all headings or near the one given.
 
     Raises
     ------
@@ -89,14 +91,16 @@ def place_on_raster(prior: Grid, patch: Grid, turn_rad: float | None = None) -> 
             f"the patch ({patch.shape[1] * cell:.0f} by {patch.shape[0] * cell:.0f} m) is larger than "
             f"the map ({prior.shape[1] * cell:.0f} by {prior.shape[0] * cell:.0f} m); are they swapped?"
         )
-    found = match_patch(without_white_error(prior), patch.elevation_m, turn_rad)
+    found = match_patch(without_white_error(prior), patch.elevation_m, turn_rad, progress=progress)
     frame = (prior.west_m, prior.north_m, cell)
     places = tuple(_of_match(m, frame) for m in found.hypotheses if m.evidence > 0)
     size = 4 * prior.elevation_m.size
     return Placing(places, found.accepted and bool(places), found.reason, size)
 
 
-def place_on_compact(carried: CompactMap, patch: Grid, turn_rad: float | None = None) -> Placing:
+def place_on_compact(
+    carried: CompactMap, patch: Grid, turn_rad: float | None = None, progress: Progress = silent
+) -> Placing:
     """Place a patch on a compact map; arguments as `place_on_raster`.
 
     Raises
@@ -107,7 +111,8 @@ def place_on_compact(carried: CompactMap, patch: Grid, turn_rad: float | None = 
     _refuse_small(in_cells(patch, carried.fine_m))
     # Counted from the patch's centre, a shift is the centre's place.
     half_e, half_n = (patch.east_m - patch.west_m) / 2, (patch.north_m - patch.south_m) / 2
-    found = match_compact(carried, replace(patch, west_m=-half_e, north_m=half_n), turn_rad)
+    centred = replace(patch, west_m=-half_e, north_m=half_n)
+    found = match_compact(carried, centred, turn_rad, progress)
     frame = (carried.west_m, carried.north_m, carried.cell_m)
     places = [_of_match(m, frame) for m in found.thumbnail.hypotheses if m.evidence > 0]
     places += [_of_placement(h) for h in found.landmarks.hypotheses]

@@ -18,6 +18,8 @@ from perception.records import BoolArray, FloatArray
 LEAST_OVERLAP = 0.4
 # Points of the patch that verify a hypothesis: more do not sharpen it and cost time.
 _VERIFY_POINTS = 4000
+# 1-sigma of a heading that is given: a compass's.
+TURN_SIGMA_RAD = float(np.radians(0.5))
 # Octaves of fewer values are left out.
 _FEWEST_VALUES = 10.0
 
@@ -72,12 +74,15 @@ def verify(values: FloatArray, patch: FloatArray, start: Match, free_turn: bool)
     field = np.full(patch.shape, np.nan)
     field[fit.rows[inside], fit.cols[inside]] = miss
     independent = _independent(field)
+    covariance = _covariance(solved, len(miss), independent, free_turn)
+    if not free_turn:
+        covariance = _with_turn(covariance, fit.lever(x, solved.jac))
     return Match(
         row=float(full[0]),
         col=float(full[1]),
         turn_rad=float(full[2] % (2 * np.pi)),
         ncc=float(np.corrcoef(here, there)[0, 1]),
-        covariance=_covariance(solved, len(miss), independent, free_turn),
+        covariance=covariance,
         misfit_m=float(miss.std()),
         independent=independent,
         evidence=evidence_of(patch, _misfit(values, patch, full)),
@@ -190,6 +195,26 @@ class _Fit:
             return np.full(len(miss), 10.0 * float(self.heights.std()) + 1.0)
         return np.where(self.inside, miss - miss[self.inside].mean(), 0.0)
 
+    def lever(self, x: FloatArray, slopes: FloatArray) -> FloatArray:
+        """How far the best place moves, (2,) cells a radian, if the given turn is wrong.
+
+        From the normal equations: ``-(J^T J)^-1 J^T g`` of the residual's slopes J by place and g by turn.
+        """
+        given, ends = self.turn, []
+        for self.turn in (given - TURN_SIGMA_RAD, given + TURN_SIGMA_RAD):
+            ends.append(self.residual(x))
+        self.turn = given
+        by_turn = (ends[1] - ends[0]) / (2 * TURN_SIGMA_RAD)
+        return -np.linalg.lstsq(slopes, by_turn, rcond=None)[0]
+
+
+def _with_turn(covariance: FloatArray, lever: FloatArray) -> FloatArray:
+    """Covariance (3, 3) of a fit at a turn that is known to a compass's error; `lever` (2,) cells a radian."""
+    if not np.isfinite(covariance).all():
+        return covariance
+    moves = np.array([*lever, 1.0]) * TURN_SIGMA_RAD
+    return covariance + np.outer(moves, moves)
+
 
 def _covariance(
     solved: optimize.OptimizeResult, number: int, independent: float, free_turn: bool
@@ -205,12 +230,18 @@ def _covariance(
     return out
 
 
-def smoothed(values: FloatArray, width: float | FloatArray) -> FloatArray:
-    """Smooth by a Gaussian of `width` cells (both axes, or one for each); NaN is left out and stays."""
+def smoothed(
+    values: FloatArray, width: float | FloatArray, least_known: float | None = None
+) -> FloatArray:
+    """Smooth by a Gaussian of `width` cells (both axes, or one for each); NaN is left out.
+
+    NaN stays where it was, or with `least_known` is where less than that part of the weight is known.
+    """
     known = np.isfinite(values)
     weight = ndimage.gaussian_filter(known.astype(float), width, mode="constant")
     total = ndimage.gaussian_filter(np.where(known, values, 0.0), width, mode="constant")
-    return np.where(known, total / np.maximum(weight, 1e-12), np.nan)
+    told = known if least_known is None else weight > least_known
+    return np.where(told, total / np.maximum(weight, 1e-12), np.nan)
 
 
 def _independent(field: FloatArray) -> float:

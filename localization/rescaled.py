@@ -11,6 +11,8 @@ from perception.records import FloatArray, Grid
 
 # Cells that agree to this part are of one size.
 _SAME = 1e-6
+# Part of a wide cell's surroundings, by weight, that must be known.
+_LEAST_KNOWN = 0.3
 
 
 def cells_of(grid: Grid) -> float:
@@ -35,7 +37,8 @@ def in_cells(grid: Grid, cell_m: float) -> Grid:
     # A cell's mean is a box; a Gaussian of its standard deviation keeps as much and does not alias.
     width = np.sqrt(np.maximum(ratio**2 - 1.0, 0.0) / 12.0)
     if width.max() > 0:
-        values = smoothed(values, width)
+        # One hole among the cells read must not cost the wide cell: filled where enough is known about it.
+        values = smoothed(values, width, least_known=_LEAST_KNOWN)
     # Whole cells about the same centre: it is the centre that is placed.
     rows, cols = (max(int(n / k), 1) for n, k in zip(grid.shape, ratio, strict=True))
     row, col = np.meshgrid(

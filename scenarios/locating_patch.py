@@ -13,17 +13,24 @@ from localization.placing import Place, Placing, place_on_compact, place_on_rast
 from mapping.rasters import read_map
 from perception.files import write_text
 from perception.geodesy import convergence, is_local
-from perception.records import Grid, InputError
+from perception.records import Grid, InputError, Progress, silent
 
 
 def place_patch(
-    prior_path: Path, patch_path: Path, heading_deg: float | None, compact: bool, out: Path
+    prior_path: Path,
+    patch_path: Path,
+    heading_deg: float | None,
+    compact: bool,
+    out: Path,
+    map_sigma_m: float | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Place a patch, write `hypotheses.csv`, the picture and `metrics.json`; return the metrics.
 
     Parameters
     ----------
-    heading_deg : azimuth of the patch's own north from true north, where it is known.
+    heading_deg : azimuth of the patch's own north from true north, where it is known, to 0.5 degrees.
+    map_sigma_m : 1-sigma of the map; None takes its band, else IHO S-44 Order 1a.
     compact : match the map's hills, hollows and thumbnail alone, a hundredth of its bytes.
 
     Raises
@@ -35,14 +42,14 @@ def place_patch(
     from scenarios.plots_navigation import draw_placing
 
     began = time.perf_counter()
-    prior, patch = read_map(prior_path), read_map(patch_path)
+    prior, patch = read_map(prior_path, map_sigma_m), read_map(patch_path)
     middle = (0.5 * (prior.west_m + prior.east_m), 0.5 * (prior.south_m + prior.north_m))
     turn = None if heading_deg is None else np.radians(heading_deg) - _convergence(prior, *middle)
     try:
         if compact:
-            placing = place_on_compact(CompactMap.of(prior), patch, turn)
+            placing = place_on_compact(CompactMap.of(prior), patch, turn, progress)
         else:
-            placing = place_on_raster(prior, patch, turn)
+            placing = place_on_raster(prior, patch, turn, progress)
     except InputError as error:
         raise InputError(f"{patch_path} on {prior_path}: {error}") from error
     metrics = summary(placing, prior, patch)
@@ -54,6 +61,7 @@ def place_patch(
         "patch": patch_path,
         "heading_deg": heading_deg,
         "compact": compact,
+        "map_sigma_m": map_sigma_m,
     }
     write_metrics(out, metrics, config)
     return metrics

@@ -32,7 +32,7 @@ from scenarios.commands.console import (
 @click.option("--altitude", type=click.FloatRange(min=0, min_open=True), default=50.0, show_default=True, help="Altitude for --observability, m.")  # fmt: skip
 @click.option("--path", "path_m", type=click.FloatRange(min=1), default=300.0, show_default=True, help="Length of track for --observability, m.")  # fmt: skip
 @click.option("--patch", type=click.Path(path_type=Path), help="Raster of sea floor to place anywhere in the map, in its own axes.")  # fmt: skip
-@click.option("--heading", type=click.FloatRange(-360.0, 360.0), help="Azimuth of the patch's own north, degrees, where it is known; else every heading is tried.")  # fmt: skip
+@click.option("--heading", type=click.FloatRange(-360.0, 360.0), help="Azimuth of the patch's own north, degrees, where it is known (to 0.5 degrees); else every heading is tried.")  # fmt: skip
 @click.option("--compact", is_flag=True, help="Place --patch by a hundredth of the map's bytes: its hills, hollows and a thumbnail.")  # fmt: skip
 @click.option("--follow", is_flag=True, help="Read rows (CSV or JSON lines) from standard input, write estimates as they come.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.")
@@ -86,7 +86,7 @@ def command(
         if patch is not None:
             from scenarios.locating_patch import place_patch
 
-            metrics = place_patch(prior, patch, heading, compact, out)
+            metrics = place_patch(prior, patch, heading, compact, out, map_sigma, progress)
         elif observability:
             metrics = observe(options, out, altitude, path_m, progress)
         else:
@@ -175,5 +175,16 @@ def _check_usage(
         )
     if (compact or heading is not None) and patch is None:
         raise click.UsageError("--heading and --compact go with --patch PATCH.tif")
+    if patch is not None:
+        _refuse_unused_by_patch()
     if out is None and not follow:
         raise click.UsageError("give --out DIR")
+
+
+def _refuse_unused_by_patch() -> None:
+    """Refuse what the user gave and a patch's placing has no use for: silence would pass for heed."""
+    context = click.get_current_context()
+    for name in ("sensors", "map_error_length", "particles", "seed"):
+        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            option = "--" + name.replace("_", "-")
+            raise click.UsageError(f"{option} goes without --patch: nothing there depends on it")

@@ -7,8 +7,11 @@ from dataclasses import replace
 import navsets
 import numpy as np
 import pytest
+from scipy import ndimage
 
+from localization import correlation
 from localization.compact import CompactMap
+from localization.constellation import Constellation, ConstellationMatch, Placement
 from localization.placing import Placing, place_on_compact, place_on_raster
 from localization.rescaled import in_cells
 from perception.records import Grid, InputError
@@ -55,13 +58,34 @@ def test_a_patch_of_any_cell_is_placed_with_its_heading(cell_m: float) -> None:
 def test_errors_are_as_large_as_claimed() -> None:
     squares = []
     for seed in range(8):
-        placing = place_on_raster(prior(0.3), patch(seed=seed, noise_m=1.0), TURN)
+        given = TURN + np.radians(0.5) * np.random.default_rng(seed).standard_normal()
+        placing = place_on_raster(prior(0.3), patch(seed=seed, noise_m=1.0), given)
         best = placing.places[0]
-        apart = np.array([best.easting_m - CENTRE_M[0], best.northing_m - CENTRE_M[1]])
-        squares.append(apart @ np.linalg.solve(best.covariance[:2, :2], apart))
-        assert np.hypot(*apart) < best.protection_m
-    # Chi-square of 16 degrees of freedom lies within 4 and 39 but for one time in a thousand.
-    assert 4.0 < sum(squares) < 39.0
+        apart = np.array(
+            [best.easting_m - CENTRE_M[0], best.northing_m - CENTRE_M[1], given - TURN]
+        )
+        squares.append(apart @ np.linalg.solve(best.covariance, apart))
+        assert np.hypot(*apart[:2]) < best.protection_m
+    # Chi-square of 24 degrees of freedom lies within 8 and 51 but for one time in a thousand.
+    assert 8.0 < sum(squares) < 51.0
+
+
+def test_a_heading_given_is_as_sure_as_a_compass_and_the_place_moves_by_its_lever() -> None:
+    """A patch whose relief lies all on one side moves sideways when it is turned about its centre."""
+    one_sided = patch(side_m=505.0, noise_m=0.05)
+    one_sided.elevation_m[:, :50] = np.nan
+    off = np.radians(0.5)
+    placings = [place_on_raster(prior(), one_sided, TURN + k * off) for k in (-1, 0, 1)]
+    assert all(p.accepted for p in placings)
+    places = [p.places[0] for p in placings]
+    moved = np.array([p.easting_m for p in places]), np.array([p.northing_m for p in places])
+    slope = np.array([(m[2] - m[0]) / (2 * off) for m in moved])
+    covariance = places[1].covariance
+    assert np.sqrt(covariance[2, 2]) == pytest.approx(off)
+    # The known part's centre is 125 m from the patch's: half a degree there is 1.1 m.
+    assert np.hypot(*slope) * off > 0.5
+    np.testing.assert_allclose(covariance[:2, 2] / covariance[2, 2], slope, atol=10.0)
+    assert np.trace(covariance[:2, :2]) > 0.8 * np.sum((slope * off) ** 2)
 
 
 def test_a_patch_partly_off_the_map_is_placed_on_what_is_left_of_it() -> None:
@@ -112,6 +136,58 @@ def test_a_hundredth_of_the_map_does_not_place_what_is_not_there() -> None:
     rng = np.random.default_rng(5)
     other = rng.standard_normal((100, 100)).cumsum(axis=0).cumsum(axis=1) / 20
     assert not place_on_compact(CompactMap.of(prior()), Grid(other, 0.0, 0.0, 5.0)).accepted
+
+
+@pytest.mark.parametrize("surplus", [1.0, 20.0])
+def test_landmarks_that_the_thumbnail_cannot_check_must_be_surer(
+    surplus: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A patch of three wide cells a side has no evidence on the thumbnail, for or against."""
+    place = Placement(*CENTRE_M, TURN, 30.0, 6, np.diag([25.0, 25.0, 1e-3]))
+    sure = ConstellationMatch((place,), True, "")
+    if surplus > 10:
+        sure = replace(sure, surplus=surplus)
+    monkeypatch.setattr(Constellation, "match", lambda *_: sure)
+    placing = place_on_compact(CompactMap.of(prior()), patch(side_m=105.0))
+    assert placing.accepted is (surplus > 10)
+    assert "not checked on the thumbnail" in placing.reason
+
+
+def test_scattered_holes_cost_no_wide_cell_and_a_large_hole_stays_one() -> None:
+    rng = np.random.default_rng(6)
+    whole = prior(0.0)
+    for share in (0.02, 0.1, 0.3):
+        height = np.where(rng.random(whole.shape) < share, np.nan, whole.elevation_m)
+        height[100:150, 100:150] = np.nan
+        wide = in_cells(replace(whole, elevation_m=height, sigma_m=None), 35.0)
+        expected = in_cells(whole, 35.0).elevation_m
+        known = np.isfinite(wide.elevation_m)
+        # 50 cells of 240 a side are a hole: 4.3 % of the area.
+        assert 0.03 < 1 - known.mean() < 0.055
+        assert np.std((wide.elevation_m - expected)[known]) < 0.05 * np.std(expected)
+
+
+def test_a_small_patch_on_a_large_map_is_searched_on_no_finer_cells_than_the_map_s(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Half cells are four times the memory of a map's cells: 2.5 GB on 2,000 cells a side."""
+    shapes, told = [], []
+
+    class Counted(correlation.Spectra):
+        def __init__(self, values: np.ndarray, patch_shape: tuple[int, int]) -> None:
+            shapes.append(values.shape)
+            super().__init__(values, patch_shape)
+
+    monkeypatch.setattr(correlation, "Spectra", Counted)
+    rng = np.random.default_rng(7)
+    large = ndimage.gaussian_filter(rng.standard_normal((400, 420)), 2.0) * 30.0
+    part = large[150:170, 200:220] + 0.02 * rng.standard_normal((20, 20))
+    found = correlation.match_patch(large, part, 0.0, progress=lambda *at: told.append(at))
+    assert shapes == [(400, 420)]
+    assert told[-1] == ("headings tried", 1, 1)
+    assert np.hypot(found.best.row - 159.5, found.best.col - 209.5) < 0.2
+    correlation.match_patch(large[100:300, 100:300], part, 0.0)
+    assert shapes[-1] == (400, 400)
 
 
 @pytest.mark.parametrize(

@@ -185,6 +185,28 @@ def test_a_patch_is_placed_with_its_heading_and_drawn(
     assert metrics["map_carried_percent"] == pytest.approx(100.0) or compact
 
 
+def test_a_patch_is_placed_on_a_map_of_the_sigma_that_is_given(
+    files: Path, drawn: NavigationSet, tmp_path: Path
+) -> None:
+    """A map said to be very wrong is smoothed before a patch is compared with it."""
+    prior = drawn.prior
+    part = Grid(prior.elevation_m[100:180, 100:180], 0.0, 400.0, prior.cell_m)
+    write_map(tmp_path / "patch.tif", part)
+    sigmas = []
+    for sigma in (0.1, 3.0):
+        out = tmp_path / str(sigma)
+        result = locate(
+            "--map", files / "prior.tif", "--patch", tmp_path / "patch.tif", "--heading", 0,
+            "--map-sigma", sigma, "--out", out,
+        )  # fmt: skip
+        assert result.exit_code == 0, result.output
+        metrics = json.loads((out / "metrics.json").read_text())
+        sigmas.append(metrics["sigma_easting_m"])
+        assert f"map_sigma_m = {sigma}" in (out / "config.toml").read_text()
+        assert metrics["sigma_heading_deg"] == pytest.approx(0.5)
+    assert sigmas[1] > 1.05 * sigmas[0]
+
+
 def test_figures_are_printed_in_words_and_one_sigma_at_a_time() -> None:
     told = in_words(
         {"sigma_last_m": 1.234567, "converged": True, "easting_m": 512345.678, "events": ""}
@@ -202,6 +224,10 @@ def test_figures_are_printed_in_words_and_one_sigma_at_a_time() -> None:
         ("--observability", "--nav", "x.csv"),
         ("--patch", "p.tif", "--follow"),
         ("--nav", "x.csv", "--compact"),
+        ("--patch", "p.tif", "--out", "out", "--sensors", "dvl.toml"),
+        ("--patch", "p.tif", "--out", "out", "--map-error-length", "20"),
+        ("--patch", "p.tif", "--out", "out", "--particles", "4000"),
+        ("--patch", "p.tif", "--out", "out", "--seed", "0"),
     ],
 )
 def test_wrong_usage_is_exit_two(files: Path, arguments: tuple[str, ...]) -> None:
