@@ -3,6 +3,9 @@
 Each kernel writes the rows [first, last) of a result and nothing else, in an order that does not depend on them: bands of
 rows may be computed by several threads, to the bit as by one. Arrays: `z` and `a` (rows, cols) nodes; `moments`
 (10, rows - 1, cols - 1) and `local` (36, rows - 1, cols - 1) packed upper triangles of the cells' matrices.
+
+What a kernel calls is written into it (``inline``): a fast-math function that was called was optimised one way when
+freshly compiled and another when linked from numba's cache, so that the first run on a machine and the second differed.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -13,7 +16,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def end_weights(i, n):
     """Return row i of D'D and of B'B over n nodes: D first, B second differences, free at the ends."""
     before = 1.0 if i >= 1 else 0.0
@@ -27,7 +30,7 @@ def end_weights(i, n):
     )
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(inline="always")
 def prior_row(z, i, k0, k1, k2, across, slope, out):
     """Write row i of (k0 + k1 D'D + k2 (B'B along each axis and twice the twist)) z: the thin plate, free at its edges.
 
@@ -60,7 +63,7 @@ def prior_row(z, i, k0, k1, k2, across, slope, out):
                     out[j] += e[q + 1] * slope[j + q]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def prior_rows(first, last, z, weights, out):
     """Write what the prior of `weights` (value, first and second difference) makes of `z`."""
     across, slope = np.empty(z.shape[1]), np.empty(z.shape[1])
@@ -68,7 +71,7 @@ def prior_rows(first, last, z, weights, out):
         prior_row(z, i, weights[0], weights[1], weights[2], across, slope, out[i])
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(inline="always")
 def feature_row(moments, i, z, a, cell, out):
     """Write the parts (4, cols - 1) of dual row i: gradient east, level less and plus gradient north, albedo."""
     half = 0.5 / cell
@@ -88,7 +91,7 @@ def feature_row(moments, i, z, a, cell, out):
         out[3, j] = 0.25 * (m3 * f0 + m6 * f1 + m8 * f2 + moments[9, i, j] * f3)
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(inline="always")
 def add_features(part, level, out_z, out_a):
     """Add a dual row's parts to one of its two rows of nodes; `level` is 1 for the south, 2 for the north one."""
     for j in range(part.shape[1]):
@@ -99,7 +102,7 @@ def add_features(part, level, out_z, out_a):
         out_a[j + 1] += part[3, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def apply_features(first, last, moments, z, a, cell, height, albedo, out_z, out_a):
     """Write rows of the finest grid's operator, data and priors, applied to (z, a)."""
     rows, cols = z.shape
@@ -117,7 +120,7 @@ def apply_features(first, last, moments, z, a, cell, height, albedo, out_z, out_
             add_features(part[i % 2], 1, out_z[i], out_a[i])
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(inline="always")
 def corner_row(local, i, z, a, out):
     """Write the parts (8, cols - 1) of dual row i for its corners' z and a: south-west, south-east, north..."""
     cells = z.shape[1] - 1
@@ -136,7 +139,7 @@ def corner_row(local, i, z, a, out):
             k += 1
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@njit(inline="always")
 def add_corners(part, north, out_z, out_a):
     """Add a dual row's parts to its south (0) or north (2) row of nodes."""
     for j in range(part.shape[1]):
@@ -147,7 +150,7 @@ def add_corners(part, north, out_z, out_a):
         out_a[j + 1] += part[5 + north, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def apply_corners(first, last, local, z, a, height, albedo, out_z, out_a):
     """Write rows of a coarser grid's operator, data and priors, applied to (z, a)."""
     rows, cols = z.shape

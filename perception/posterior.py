@@ -9,6 +9,7 @@ four children, which makes a multigrid preconditioner cheap.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +28,8 @@ from perception.stencils import (
     rows_and_gain,
     spread_features,
 )
+
+logger = logging.getLogger(__name__)
 
 # Heights, log-albedo and gains.
 Fields = tuple[FloatArray, FloatArray, FloatArray]
@@ -88,9 +91,6 @@ class Problem:
     gain_block: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        rows, cols = self.shape
-        moments = np.zeros((10, (rows - 1) * (cols - 1)), np.float32)
-        accumulate_moments(self.cell, self.weight, self.c_east, self.c_north, self.c_level, moments)
         block = self.gain_precision.copy()
         gain_normal(self.knot, self.share, self.weight, block)
         self.gain_block = block
@@ -103,10 +103,23 @@ class Problem:
             )
             for depth in range(2 if can_halve(self.shape) else 1)
         ]  # fmt: skip
-        self.hierarchy = Hierarchy.build(
+        self.hierarchy = self._hierarchy(couplings)
+
+    def _hierarchy(self, couplings: list[Coupling]) -> Hierarchy:
+        rows, cols = self.shape
+        moments = np.zeros((10, (rows - 1) * (cols - 1)), np.float32)
+        accumulate_moments(self.cell, self.weight, self.c_east, self.c_north, self.c_level, moments)
+        return Hierarchy.build(
             self.cell_m, moments.reshape(10, rows - 1, cols - 1), self.height, self.albedo,
-            Tie.of(self.rows, self.row_weight), couplings, block,
+            Tie.of(self.rows, self.row_weight), couplings, self.gain_block,
         )  # fmt: skip
+
+    def _untied(self) -> Hierarchy:
+        """Return grids that solve fields and gains apart: slower, but positive however the ties are rounded."""
+        nothing = sparse.csr_matrix(
+            (self.shape[0] * self.shape[1], len(self.gain_block)), dtype=np.float32
+        )
+        return self._hierarchy([Coupling(self.shape, nothing, nothing)])
 
     def apply(self, z: FloatArray, a: FloatArray, gain: FloatArray) -> Fields:
         out_z, out_a = self.hierarchy.levels[0].apply(z, a)
@@ -185,15 +198,40 @@ class Problem:
         Stops where the error is `tolerance` posterior sigmas in all: no combination of heights is then further from the
         solution than that, however the data scale. The cycle measures the error squared short by its least
         eigenvalue, a hundredth where one pass is all there is; the steps so far tell it (Lanczos).
+
+        What is tied in single precision may round to a cycle that is not positive, with which no step can be trusted:
+        the rest is then solved with fields and gains apart, which a warning tells, as it does where `most` steps
+        do not get there.
         """
         x: Fields = (start[0].copy(), start[1].copy(), start[2].copy())
+        # The cycle's least eigenvalue is hardly below this in the best of cases.
+        steps, positive = self._descend(self.hierarchy, x, right, tolerance, most, 0.2)
+        if not positive:
+            logger.warning(
+                "joint inversion: the preconditioner is not positive after %d steps; "
+                "going on with fields and gains apart", steps,
+            )  # fmt: skip
+            more, positive = self._descend(self._untied(), x, right, tolerance, most, 0.0)
+            steps += more
+            if not positive:
+                logger.warning("joint inversion: ended short of its tolerance, not positive again")
+        return x, steps
+
+    def _descend(
+        self, grids: Hierarchy, x: Fields, right: Fields, tolerance: float, most: int, least: float
+    ) -> tuple[int, bool]:
+        """Step `x` towards the solution, in place; return the steps and whether the cycle proved positive.
+
+        `grids` : whose cycle is the preconditioner; `least` : eigenvalue it is taken to have before any step tells.
+        """
         r: Fields = (right[0].copy(), right[1].copy(), right[2].copy())
         add_times(r, -1.0, self.apply(*x))
-        p = self.hierarchy.cycle(*r)
+        # Below this a residual is rounding, and so is its sign in the cycle.
+        rounding = 1e-20 * dot(right, right)
+        p = grids.cycle(*r)
         rs = dot(r, p)
-        # The cycle's least eigenvalue is hardly below this in the best of cases.
-        if rs <= 0.2 * tolerance**2:
-            return x, 0
+        if rs <= max(least * tolerance**2, 0.0):
+            return 0, rs > 0 or dot(r, r) <= rounding
         alphas: list[float] = []
         betas: list[float] = []
         for k in range(most):
@@ -201,14 +239,17 @@ class Problem:
             alphas.append(rs / dot(p, y))
             add_times(x, alphas[-1], p)
             add_times(r, -alphas[-1], y)
-            s = self.hierarchy.cycle(*r)
+            s = grids.cycle(*r)
             following = dot(r, s)
+            if following <= 0 and dot(r, r) > rounding:
+                return k + 1, False
             if following <= tolerance**2 * _least_eigenvalue(alphas, betas):
-                return x, k + 1
+                return k + 1, True
             betas.append(following / rs)
             add_times(s, betas[-1], p)
             p, rs = s, following
-        return x, most
+        logger.warning("joint inversion: %d steps did not reach the tolerance", most)
+        return most, True
 
 
 def _least_eigenvalue(alphas: list[float], betas: list[float]) -> float:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -336,3 +341,72 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monk
     bands._pool.cache_clear()
     for one, three in zip(*answers, strict=True):
         assert np.array_equal(one, three)
+
+
+@pytest.mark.usefixtures("many_grids")
+@pytest.mark.parametrize("factor", [-1.0, -30.0])
+def test_a_cycle_that_is_not_positive_is_left_and_the_solution_still_found(
+    factor: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A negative product once met the stop test: a half-done solution was returned as if it were one."""
+    problem = small_problem(np.random.default_rng(2))
+    right = problem.right_side()
+    problem.hierarchy.coarsest.gain_inverse *= factor
+    start = (np.zeros(problem.shape), np.zeros(problem.shape), np.zeros(5))
+    with caplog.at_level(logging.WARNING, "perception"):
+        found, steps = problem.solve(start, right, tolerance=1e-6, most=200)
+    assert [record.message.split(":")[0] for record in caplog.records] == ["joint inversion"]
+    assert "not positive" in caplog.text and "apart" in caplog.text
+    expected = np.linalg.solve(dense(problem), np.concatenate([part.ravel() for part in right]))
+    solution = np.concatenate([part.ravel() for part in found])
+    assert_allclose(solution, expected, atol=1e-5 * np.abs(expected).max())
+    assert steps < 200
+
+
+@pytest.mark.usefixtures("many_grids")
+def test_a_solution_short_of_its_tolerance_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    problem = small_problem(np.random.default_rng(2))
+    start = (np.zeros(problem.shape), np.zeros(problem.shape), np.zeros(5))
+    with caplog.at_level(logging.WARNING, "perception"):
+        exact, _ = problem.solve(start, problem.right_side(), tolerance=1e-6, most=200)
+        assert not caplog.records
+        # From the solution itself there is rounding to go on with at the most.
+        problem.solve(exact, problem.right_side())
+        assert not caplog.records
+        _, steps = problem.solve(start, problem.right_side(), tolerance=1e-6, most=2)
+    assert steps == 2 and "2 steps did not reach the tolerance" in caplog.text
+
+
+# What every kernel of a grid makes of the same numbers.
+_KERNELS = """
+import hashlib
+import numpy as np
+from perception.level_kernels import apply_corners, apply_features, prior_rows
+rng = np.random.default_rng(0)
+z, a, oz, oa = rng.standard_normal((4, 33, 49))
+moments = rng.random((10, 32, 48)).astype(np.float32)
+local = rng.random((36, 32, 48)).astype(np.float32)
+said = hashlib.sha256()
+prior_rows(0, 33, z, (0.1, 0.5, 3.0), oz)
+said.update(oz.tobytes())
+apply_features(0, 33, moments, z, a, 0.7, (0.1, 0.5, 3.0), (0.1, 1.0, 2.0), oz, oa)
+said.update(oz.tobytes() + oa.tobytes())
+apply_corners(0, 33, local, z, a, (0.1, 0.5, 3.0), (0.1, 1.0, 2.0), oz, oa)
+said.update(oz.tobytes() + oa.tobytes())
+print(said.hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_kernels_freshly_compiled_and_from_the_cache_agree_to_the_bit(tmp_path: Path) -> None:
+    """The first map of a machine and its second once differed in the fifth decimal of a metre."""
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", _KERNELS], check=True, capture_output=True, text=True,
+            cwd=Path(__file__).resolve().parents[2],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+        ).stdout
+        for _ in range(2)
+    ]  # fmt: skip
+    assert any(tmp_path.rglob("*.nbi"))
+    assert said[0] == said[1]
