@@ -127,7 +127,9 @@ def match_compact(
     if thumb.accepted:
         return CompactMatch(thumb, marks, thumb.best, False, f"the two disagree: {named}")
     # The landmarks are sure: the thumbnail, which is not, must at least not know a better place.
-    tried = verify(heights, wide, _match_of(carried, place), free_turn=turn_rad is None)
+    tried = _match_of(carried, place)
+    if np.isfinite(wide).any():
+        tried = verify(heights, wide, tried, free_turn=turn_rad is None)
     if tried.evidence > 0:
         stands = tried.evidence > thumb.best.evidence - _BEHIND
         return CompactMatch(thumb, marks, place, stands, named)

@@ -30,6 +30,8 @@ _CHANCE = 45.0
 # The same over all octaves at once: of strong, smooth, real grounds wrong places had 0, right ones above
 # 1,000; patches of weak relief on a thumbnail have some 100.
 _PLAIN = 60.0
+# Cells a side that a patch keeps in the coarse search: of 30 cells thinned by 7 nothing can be recognised.
+_FEWEST_COARSE = 12
 # Places are ranked without what a Gaussian of this part of the patch keeps, but of so many cells at least
 # (of parts of 3, 6 and 12 the last ranked best, docs/terrain-navigation.md).
 _LONGEST_PART, _SHARPEST = 12.0, 2.0
@@ -124,10 +126,13 @@ def match_patch(
         Never empty; without relief or overlap the one hypothesis has correlation -1.
     """
     thin = float(max(1, round(max(values.shape) / _COARSE_SIDE))) if turn_rad is None else 1.0
+    thin = min(thin, float(max(1, min(patch.shape) // _FEWEST_COARSE)))
     if min(patch.shape) < _FINE_SIDE:
         # Of few wide cells, half a cell beside the place no short wave fits any more.
         thin = 0.5 if max(values.shape) <= _COARSE_SIDE else 1.0
     coarse_map, coarse_patch = _thinned(values, thin), _thinned(patch, thin)
+    if not np.isfinite(patch).any():
+        return _judge([_nowhere(turn_rad or 0.0)])
     turns = (
         np.arange(0.0, 2 * np.pi - step_rad / 2, step_rad)
         if turn_rad is None
@@ -216,9 +221,14 @@ def _candidates(
             told[max(i - near, 0) : i + near + 1, max(j - near, 0) : j + near + 1] = 0.0
     progress("headings tried", len(turns), len(turns))
     if not found:
-        return [Match(0.0, 0.0, float(turns[0]), -1.0, np.full((3, 3), np.nan), np.nan)]
+        return [_nowhere(float(turns[0]))]
     found.sort(key=lambda f: -f[0])
     return _distinct([match for _, match in found], max(shape) / 200)
+
+
+def _nowhere(turn_rad: float) -> Match:
+    """What stands for a place where none was found."""
+    return Match(0.0, 0.0, turn_rad, -1.0, np.full((3, 3), np.nan), np.nan)
 
 
 def _sharpened(values: FloatArray, width: float) -> FloatArray:

@@ -153,6 +153,19 @@ def test_landmarks_that_the_thumbnail_cannot_check_must_be_surer(
     assert "not checked on the thumbnail" in placing.reason
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_patch_with_no_wide_cell_at_all_is_no_fix(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One cell in nine has a height: too few for the thumbnail; the landmarks say they know."""
+    place = Placement(*CENTRE_M, TURN, 30.0, 6, np.diag([25.0, 25.0, 1e-3]))
+    sure = ConstellationMatch((place,), True, "")
+    monkeypatch.setattr(Constellation, "match", lambda *_: sure)
+    sparse = np.full((100, 100), np.nan)
+    sparse[::3, ::3] = np.random.default_rng(8).standard_normal((34, 34)).cumsum(axis=0)
+    placing = place_on_compact(CompactMap.of(prior()), Grid(sparse, 0.0, 0.0, 5.0))
+    assert not placing.accepted
+    assert "not checked on the thumbnail" in placing.reason
+
+
 def test_scattered_holes_cost_no_wide_cell_and_a_large_hole_stays_one() -> None:
     rng = np.random.default_rng(6)
     whole = prior(0.0)
@@ -188,6 +201,15 @@ def test_a_small_patch_on_a_large_map_is_searched_on_no_finer_cells_than_the_map
     assert np.hypot(found.best.row - 159.5, found.best.col - 209.5) < 0.2
     correlation.match_patch(large[100:300, 100:300], part, 0.0)
     assert shapes[-1] == (400, 400)
+
+
+def test_the_coarse_search_leaves_enough_of_a_small_patch_to_know_it_by() -> None:
+    rng = np.random.default_rng(9)
+    long = ndimage.gaussian_filter(rng.standard_normal((300, 2100)), 0.8) * 30.0
+    part = long[61:91, 1203:1233] + 0.02 * rng.standard_normal((30, 30))
+    found = correlation.match_patch(long, part, None, step_rad=np.pi / 2)
+    assert found.accepted, found.reason
+    assert np.hypot(found.best.row - 75.5, found.best.col - 1217.5) < 0.2
 
 
 @pytest.mark.parametrize(
