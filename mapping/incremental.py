@@ -16,6 +16,7 @@ import numpy as np
 from mapping.crossings import height_steps
 from mapping.fixes import PositionFix
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
+from mapping.link_choice import apart
 from mapping.overlaps import Window, find_overlaps
 from mapping.placing import on_track
 from mapping.pose_graph import HeightStep, Link, Solution, solve
@@ -106,7 +107,7 @@ class IncrementalSurvey:
         self._graph.add_pass(keyframes, ties)
         found = self._match(keyframes, progress)
         solution = self._graph.solution()
-        used = iter(solution.link_used[len(self._graph.links) - len(found[1]) :])
+        used = iter(solution.link_used[found[2] :])
         registrations = [
             Registration(w, m, bool(next(used)) if m.accepted else False) for w, m in found[0]
         ]
@@ -120,12 +121,19 @@ class IncrementalSurvey:
 
     def _match(
         self, keyframes: Keyframes, progress: Progress
-    ) -> tuple[list[tuple[Window, Match]], list[Link]]:
-        """Register the newest pass by narrowing squares; leave the last round's links in the graph."""
+    ) -> tuple[list[tuple[Window, Match]], list[Link], int]:
+        """Register the newest pass by narrowing squares; leave the links that know most of each piece of ground.
+
+        Returns the last round's comparisons, its links, and the number of the first of those in the graph.
+        """
         config, graph, new = self._config, self._graph, len(self._strips) - 1
         solution = graph.solution()
         results: list[tuple[Window, Match]] = []
         links: list[Link] = []
+        before = 0
+        # Links of all rounds that the graph did not doubt, by their number there.
+        pool: list[tuple[Window, Link]] = []
+        numbers: list[int] = []
         for number, part in enumerate(config.squares, start=1):
             corrected = on_track(self._thin, keyframes, solution)
             side_m = max(part * swath_width(self._strips), least_square_m(self._cell_m))
@@ -144,12 +152,32 @@ class IncrementalSurvey:
             ]
             before = len(graph.links)
             graph.add_links(links, steps)
-            self._squares += [w for w, m in results if m.accepted]
+            squares = [w for w, m in results if m.accepted]
+            self._squares += squares
             self._steps += steps
             solution = self._doubted(keyframes, before)
+            kept = np.flatnonzero(solution.link_used[before:])
+            pool += [(squares[i], links[i]) for i in kept]
+            numbers += [before + int(i) for i in kept]
             if not last:
                 graph.take_out(range(before, len(graph.links)))
-        return results, links
+        chosen = {id(link) for _, link in apart(pool)}
+        in_graph = graph.solution().link_used
+        graph.take_out(
+            [
+                n
+                for n, (_, link) in zip(numbers, pool, strict=True)
+                if in_graph[n] and id(link) not in chosen
+            ]
+        )
+        back = [
+            (w, link)
+            for n, (w, link) in zip(numbers, pool, strict=True)
+            if not in_graph[n] and id(link) in chosen
+        ]
+        graph.add_links([link for _, link in back], [])
+        self._squares += [w for w, _ in back]
+        return results, links, before
 
     def _doubted(self, keyframes: Keyframes, first: int) -> Solution:
         """Take out the links from `first` on that contradict the rest (GNC knows no increments)."""

@@ -98,7 +98,8 @@ def plant(passes: int, rng: np.random.Generator, progress: Progress) -> Planted:
         gaussian_filter(rng.normal(size=(1024, 1024)), 2.0, mode="wrap"),
     )
     albedo *= 1.5 * np.log(10) / 10 / albedo.std()
-    strips, places = [], []
+    strips: list[ElevationStrip] = []
+    places: list[FloatArray] = []
     error, clock, ping = np.zeros(2), 1.7e9, 0
     for index, (east, north, heading_deg) in enumerate(_legs(passes)):
         heading = np.radians(heading_deg)
@@ -106,7 +107,11 @@ def plant(passes: int, rng: np.random.Generator, progress: Progress) -> Planted:
         bias, scale = np.radians(_BIAS_DEG) * rng.normal(), _SCALE * rng.normal()
         along = _STEP_M * np.arange(_PINGS)
         truth = _ORIGIN_M + [east, north] + along[:, None] * ahead
-        error = error + _WALK_M * np.sqrt(_TURN_M / 1000) * rng.normal(size=2) * (index > 0)
+        if index:
+            # From line to line it sails, and drifts, as far as the next line is away.
+            transit_m = max(_TURN_M, float(np.hypot(*(truth[0] - places[-1][-1]))))
+            clock += transit_m / _SPEED_M_S
+            error = error + _WALK_M * np.sqrt(transit_m / 1000) * rng.normal(size=2)
         walk = _WALK_M * np.sqrt(_STEP_M / 1000) * rng.normal(size=(_PINGS, 2))
         walk += _STEP_M * (scale * ahead + bias * np.array([ahead[1], -ahead[0]]))
         errors = error + np.cumsum(walk, axis=0)
@@ -116,7 +121,7 @@ def plant(passes: int, rng: np.random.Generator, progress: Progress) -> Planted:
                   ping, index, rng)
         )  # fmt: skip
         places.append(truth)
-        clock, ping = clock + (along[-1] + _TURN_M) / _SPEED_M_S, ping + _PINGS
+        clock, ping = clock + along[-1] / _SPEED_M_S, ping + _PINGS
         progress("planting strips", index + 1, passes)
     ends = ((strips[0].time_s[0], places[0][0]), (strips[-1].time_s[-1], places[-1][-1]))
     fixes = [_fix(float(t), place + _FIX_M * rng.normal(size=2)) for t, place in ends]
