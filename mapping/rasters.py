@@ -126,6 +126,10 @@ class OpenMap:
         elif self.sigma_beside:
             with rasterio.open(self.sigma_beside) as beside:
                 sigma = _read_band(beside, 1, window)
+        if sigma is not None and np.fmin.reduce(sigma, axis=None, initial=0.0) < 0:
+            raise InputError(
+                f"{self.path}: holds a negative sigma ({np.nanmin(sigma):g}); mend its band, or give --map-sigma"
+            )
         square = np.isclose(transform.a, -transform.e, rtol=1e-9)
         return Grid(
             elevation_m=elevation_m,

@@ -85,6 +85,7 @@ def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked
     else:
         grid = read_map(given.map_path, given.map_sigma)
     _tell_of_sigma(given, grid, limits)
+    _tell_of_dry_ground(given, grid)
     problem = posed(given, grid, from_true_north(limits, grid, given.start, given.goal), None)
     if reduced is None:
         # Of block means the ends are judged at full resolution, later.
@@ -194,6 +195,17 @@ def _tell_of_sigma(given: Given, grid: Grid, limits: VehicleLimits) -> None:
         )  # fmt: skip
 
 
+def _tell_of_dry_ground(given: Given, grid: Grid) -> None:
+    """Warn where a map has no ground under water: heights may be depths, counted downwards."""
+    import numpy as np
+
+    if np.nanmin(grid.elevation_m) > 0:
+        logger.warning(
+            "%s: all its heights lie above zero, so it is taken for dry ground without a water surface; if they are "
+            "depths, turn them: gdal_calc.py -A MAP.tif --calc=-A", given.map_path,
+        )  # fmt: skip
+
+
 def from_true_north(
     limits: VehicleLimits,
     grid: Grid,
@@ -299,6 +311,11 @@ def standing(path: Path | None, whole: Grid) -> Callable[[Grid], Obstacles | Non
     from planning.obstacles import obstacles_on
 
     objects = read_objects(path, whole)
+    if len(objects.height_m) and not np.isfinite(objects.height_m).any():
+        raise InputError(
+            f"{path}: gives no object a height (column height_m); give the objects.gpkg or objects.csv "
+            "of bathynav map or strips"
+        )
     row, col = whole.fractional_index(objects.easting_m, objects.northing_m)
     rows, cols = whole.shape
     on_map = (row > -1) & (row < rows) & (col > -1) & (col < cols)

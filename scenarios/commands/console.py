@@ -8,11 +8,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from perception.records import InputError, Progress, silent
+
+if TYPE_CHECKING:
+    from perception.readers import Survey
 
 # A log is told of a long step this often.
 _LINE_SECONDS = 15.0
@@ -136,3 +139,12 @@ def print_table(title: str, rows: list[tuple[str, str]]) -> None:
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         click.echo(f"  {name:<{width}}  {value}")
+
+
+def tell_of(survey: Survey) -> None:
+    """Say what is wrong with a survey and with each of its files, a line each on standard error."""
+    for warning in survey.warnings:
+        click.echo(f"note: {warning}", err=True)
+    for file in survey.files:
+        for defect in file.defects:
+            click.echo(f"note: {file.path.name}: {defect}", err=True)

@@ -16,6 +16,7 @@ from scenarios.commands.console import (
     print_table,
     progress_bars,
     set_verbosity,
+    tell_of,
 )
 
 _FIX_REACH_S = 3600.0  # fixes further from every ping say nothing of the survey
@@ -119,7 +120,7 @@ class _Tiling:
 @click.option(
     "--incremental",
     is_flag=True,
-    help="Correct the track pass by pass, each as it comes, instead of all at once.",
+    help="Correct the track pass by pass, each as it comes: less accurate than all at once.",
 )
 @click.option(
     "--tiles", is_flag=True, help="Make the map in tiles; the default beyond 25 million cells."
@@ -156,8 +157,7 @@ def command(surveys: tuple[Path, ...], out: Path, quiet: bool, verbose: bool, **
     with progress_bars(quiet) as progress:
         survey = open_survey(surveys, crs=options.crs, installation=installation, progress=progress)
         if not quiet:
-            for warning in survey.warnings:
-                click.echo(f"note: {warning}", err=True)
+            tell_of(survey)
         _check_frames(options, files, survey)
         tiling = options.tiling
         method, in_tiles = _choose(survey, options.cell, options.method, tiling, quiet)

@@ -14,6 +14,7 @@ from scenarios.commands.console import (
     print_table,
     progress_bars,
     set_verbosity,
+    tell_of,
 )
 from scenarios.outputs import write_metrics
 
@@ -77,8 +78,7 @@ def command(
     with progress_bars(quiet) as progress:
         survey = open_survey(surveys, crs=crs, installation=installation, progress=progress)
         if not quiet:
-            for warning in survey.warnings:
-                click.echo(f"note: {warning}", err=True)
+            tell_of(survey)
         # Not before all inputs are read: a mistyped name must not cost the strips that are there.
         _clear(out)
         metrics = _write_passes(out, survey, config, _title(surveys), progress)

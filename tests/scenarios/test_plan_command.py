@@ -534,3 +534,26 @@ def test_ends_off_the_map_are_refused_before_the_map_is_segmented(chart, tmp_pat
 def test_a_number_that_is_none_is_refused_as_wrong_usage(chart, tmp_path):
     result = plan(chart, tmp_path, "--swath", "nan")
     assert "--swath must be a number, got nan" in str(result.exception)
+
+
+def test_a_table_that_lists_no_objects_is_refused(chart, tmp_path):
+    path = tmp_path / "nav.csv"
+    path.write_text(f"time_s,easting_m,northing_m\n1,{WEST + 20},{NORTH - 20}\n")
+    result = plan(chart, tmp_path / "out", "--objects", path)
+    assert isinstance(result.exception, InputError)
+    assert "gives no object a height" in str(result.exception)
+
+
+def test_a_map_of_depths_counted_downwards_is_told(tmp_path, caplog):
+    grid = grid_of(-canyon(n=160, seed=4, wall_m=12.0))
+    write_map(tmp_path / "map.tif", grid)
+    plan(tmp_path / "map.tif", tmp_path / "out")
+    assert "all its heights lie above zero" in caplog.text
+
+
+def test_a_negative_sigma_is_refused_with_its_value(tmp_path):
+    grid = grid_of(flat())
+    write_map(tmp_path / "map.tif", replace(grid, sigma_m=np.full(grid.shape, -0.5)))
+    result = plan(tmp_path / "map.tif", tmp_path / "out")
+    assert isinstance(result.exception, InputError)
+    assert "negative sigma (-0.5)" in str(result.exception)
