@@ -80,12 +80,12 @@ def _remove_empty(folders: list[Path]) -> None:
 
 @contextmanager
 def progress_bars(quiet: bool = False) -> Iterator[Progress]:
-    """Yield a `Progress` that draws one bar per label on a terminal, and tells a pipe a line now and then."""
+    """Yield a `Progress` that draws one bar per label on a terminal; a pipe is told a line now and then with `-v`."""
     if quiet:
         yield silent
         return
     if not sys.stderr.isatty():
-        yield progress_lines()
+        yield progress_lines() if logging.getLogger().isEnabledFor(logging.INFO) else silent
         return
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
