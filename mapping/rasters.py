@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,6 +21,8 @@ from rasterio.windows import Window
 from mapping.cog import RASTER_ERRORS, Statistics
 from perception.files import existing_file, whole_file
 from perception.records import FloatArray, Grid, InputError
+
+logger = logging.getLogger(__name__)
 
 _SIGMA_NAMES = ("sigma", "uncertainty", "std", "stddev", "standard deviation")
 _ELEVATION_NAMES = ("elevation", "bathymetry", "height", "z", "topo", "depth")
@@ -126,10 +129,11 @@ class OpenMap:
         elif self.sigma_beside:
             with rasterio.open(self.sigma_beside) as beside:
                 sigma = _read_band(beside, 1, window)
-        if sigma is not None and np.fmin.reduce(sigma, axis=None, initial=0.0) < 0:
-            raise InputError(
-                f"{self.path}: holds a negative sigma ({np.nanmin(sigma):g}); mend its band, or give --map-sigma"
+        if sigma is not None and (sigma < 0).any():
+            logger.warning(
+                "%s: holds negative sigmas (%g): taken for unknown", self.path, np.nanmin(sigma)
             )
+            sigma = np.where(sigma < 0, np.nan, sigma)
         square = np.isclose(transform.a, -transform.e, rtol=1e-9)
         return Grid(
             elevation_m=elevation_m,
