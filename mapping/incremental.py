@@ -16,7 +16,7 @@ import numpy as np
 from mapping.crossings import height_steps
 from mapping.fixes import PositionFix
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
-from mapping.link_choice import apart
+from mapping.link_choice import apart_numbers
 from mapping.overlaps import Window, find_overlaps
 from mapping.placing import on_track
 from mapping.pose_graph import HeightStep, Link, Solution, solve
@@ -161,20 +161,10 @@ class IncrementalSurvey:
             numbers += [before + int(i) for i in kept]
             if not last:
                 graph.take_out(range(before, len(graph.links)))
-        chosen = {id(link) for _, link in apart(pool)}
-        in_graph = graph.solution().link_used
-        graph.take_out(
-            [
-                n
-                for n, (_, link) in zip(numbers, pool, strict=True)
-                if in_graph[n] and id(link) not in chosen
-            ]
-        )
-        back = [
-            (w, link)
-            for n, (w, link) in zip(numbers, pool, strict=True)
-            if not in_graph[n] and id(link) in chosen
-        ]
+        chosen = set(apart_numbers(pool))
+        in_graph = graph.solution().link_used[numbers]
+        graph.take_out([numbers[i] for i in np.flatnonzero(in_graph) if i not in chosen])
+        back = [pool[i] for i in np.flatnonzero(~in_graph) if i in chosen]
         graph.add_links([link for _, link in back], [])
         self._squares += [w for w, _ in back]
         return results, links, before

@@ -89,6 +89,11 @@ def apart(pool: Sequence[tuple[Window, Link]]) -> list[tuple[Window, Link]]:
     Squares of several widths over one place see the same echoes: both together would count them twice. A wide
     square holds more and bends more with the drift; which of the two tells more, their covariances say.
     """
+    return [pool[i] for i in apart_numbers(pool)]
+
+
+def apart_numbers(pool: Sequence[tuple[Window, Link]]) -> list[int]:
+    """Return which registrations `apart` returns, by their place in the pool."""
     kept: dict[tuple[int, int], list[Window]] = defaultdict(list)
     chosen = []
     order = sorted(range(len(pool)), key=lambda i: float(np.trace(pool[i][1].covariance_m2)))
@@ -98,7 +103,7 @@ def apart(pool: Sequence[tuple[Window, Link]]) -> list[tuple[Window, Link]]:
         if not any(_overlap(window, other) for other in there):
             there.append(window)
             chosen.append(index)
-    return [pool[i] for i in sorted(chosen)]
+    return sorted(chosen)
 
 
 def _overlap(one: Window, other: Window) -> bool:

@@ -32,7 +32,6 @@ def link_of(
     """
     centre = np.array([window.easting_m, window.northing_m])
     unknown_m = None if floor is None else _typical_sigma(floor, window)
-    q2 = config.drift_m_per_sqrt_km**2 / 1000.0
     covariance = result.covariance_m2 + _LEFT_OVER_M**2 * np.eye(2)
     blends, offsets, ground = [], [], []
     for strip, line in ((window.first, window.first_line), (window.second, window.second_line)):
@@ -44,7 +43,7 @@ def link_of(
         blends.append(blend)
         offsets.append(offset)
         ground.append(correction + swing)
-        covariance = covariance + q2 * left_m * np.eye(2)
+        covariance = covariance + config.walk_m2_per_m * left_m * np.eye(2)
         nearest = keyframes.nearest(strip, line)
         covariance = covariance + _misplacement(
             strips[strip], keyframes, nearest, offset, unknown_m

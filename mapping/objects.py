@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -90,8 +90,7 @@ def merge_objects(
     least, radius = _optional(tables, "lower_bound", bool), _radius(tables)
     where = np.hypot(_CENTRE_SIGMA_M, position[owner]) if len(owner) else np.zeros(0)
     group, rivals = _group(points, where, owner, kind, height, sigma, least)
-    merged = _summarise(points, where, owner, kind, height, sigma, group, rivals)
-    return _with_extent(merged, height, sigma, least, radius)
+    return _summarise(points, where, owner, kind, height, sigma, group, rivals, least, radius)
 
 
 def _column(tables: Sequence[Looks], name: str) -> FloatArray:
@@ -138,14 +137,20 @@ def _group(
 
 def _summarise(
     points: FloatArray, where: FloatArray, owner: IntArray, kind: npt.NDArray[Any], height: FloatArray,
-    sigma: FloatArray, group: IntArray, rivals: Sequence[tuple[int, int]],
+    sigma: FloatArray, group: IntArray, rivals: Sequence[tuple[int, int]], least: npt.NDArray[np.bool_],
+    radius: FloatArray,
 ) -> MergedObjects:  # fmt: skip
     _, look = np.unique(group, return_inverse=True)
     n = int(look.max()) + 1 if len(look) else 0
     first = np.zeros(n, np.int64)
     first[look[::-1]] = np.arange(len(look))[::-1]
     looks = np.bincount(look, minlength=n)
-    h, h_sigma = _weighted(height, sigma, look, n, looks)
+    open_only = np.bincount(look, ~least, minlength=n) == 0
+    counts = ~least | _greatest(height, look, open_only)
+    told = look[counts]
+    h, h_sigma = _weighted(height[counts], sigma[counts], told, n, np.bincount(told, minlength=n))
+    widest = np.full(n, -np.inf)
+    np.fmax.at(widest, look, radius)
     east, e_sigma = _weighted(points[:, 0], where, look, n, looks)
     north, n_sigma = _weighted(points[:, 1], where, look, n, looks)
     disputed = np.zeros(n, bool)
@@ -164,37 +169,20 @@ def _summarise(
         passes=np.array([len(set(owner[look == k])) for k in range(n)], np.int64),
         disputed=disputed,
         look=look,
-        radius_m=np.full(n, np.nan),
-        least=np.zeros(n, bool),
+        radius_m=np.where(np.isfinite(widest), widest, np.nan),
+        least=open_only,
     )
 
 
-def _with_extent(
-    merged: MergedObjects, height: FloatArray, sigma: FloatArray, least: npt.NDArray[np.bool_],
-    radius: FloatArray,
-) -> MergedObjects:  # fmt: skip
-    """Return the objects with their footprints, and with heights told apart from least heights."""
-    n, look = len(merged), merged.look
-    widest = np.full(n, -np.inf)
-    np.fmax.at(widest, look, radius)
-    open_only = np.bincount(look, ~least, minlength=n) == 0
-    h, h_sigma = merged.height_m.copy(), merged.sigma_m.copy()
-    for k in np.flatnonzero(np.bincount(look, least, minlength=n) > 0):
-        mine = look == k
-        if open_only[k]:
-            best = np.flatnonzero(mine)[np.argmax(height[mine])]
-            h[k], h_sigma[k] = height[best], sigma[best]
-        else:
-            closed = mine & ~least
-            mean, error = _weighted(
-                height[closed], sigma[closed], np.zeros(closed.sum(), np.int64), 1,
-                np.array([closed.sum()]),
-            )  # fmt: skip
-            h[k], h_sigma[k] = mean[0], error[0]
-    return replace(
-        merged, height_m=h, sigma_m=h_sigma, least=open_only,
-        radius_m=np.where(np.isfinite(widest), widest, np.nan),
-    )  # fmt: skip
+def _greatest(
+    height: FloatArray, look: IntArray, wanted: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.bool_]:
+    """Return which look is the highest of each wanted object, the first of equals."""
+    highest = np.zeros(len(height), bool)
+    for k in np.flatnonzero(wanted):
+        mine = np.flatnonzero(look == k)
+        highest[mine[np.argmax(height[mine])]] = True
+    return highest
 
 
 def _optional(tables: Sequence[Looks], name: str, kind: type) -> npt.NDArray[Any]:

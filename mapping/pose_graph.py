@@ -57,6 +57,16 @@ class GraphConfig:
     height_m: float = 0.1
     outlier_probability: float = 0.01
 
+    @property
+    def walk_m2_per_m(self) -> float:
+        """Variance (m2 an axis) of the random walk for each metre of way."""
+        return self.drift_m_per_sqrt_km**2 / 1000.0
+
+    @property
+    def rate2(self) -> float:
+        """Variance (an axis) by which a pass's scale and course errors carry it off, for each square metre of way."""
+        return float(self.scale**2 + np.radians(self.heading_bias_deg) ** 2)
+
 
 @dataclass(frozen=True, slots=True)
 class Blend:

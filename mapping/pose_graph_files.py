@@ -118,7 +118,7 @@ def _odometry(keyframes: Keyframes, solution: Solution, place: FloatArray) -> li
         step = place[k] - place[k - 1]
         scale, course, _ = solution.pass_errors[keyframes.strip[k - 1]]
         step = step + scale * step + course * perpendicular(step)
-        walk = solution.config.drift_m_per_sqrt_km**2 * keyframes.way_m[k] / 1000.0
+        walk = solution.config.walk_m2_per_m * keyframes.way_m[k]
         walk = max(float(walk + keyframes.jump_m[k] ** 2), 1e-6)
         relations.append((int(k) - 1, int(k), step, walk * np.eye(2)))
     return relations

@@ -95,6 +95,5 @@ def _walked(
     """Return the variance (m2, an axis) of the walk between keyframes of one pass."""
     along_m = np.cumsum(np.nan_to_num(keyframes.way_m))
     way_m = np.abs(along_m[one] - along_m[other])
-    rate = config.scale**2 + np.radians(config.heading_bias_deg) ** 2
-    variance: FloatArray = config.drift_m_per_sqrt_km**2 * way_m / 1000.0 + rate * way_m**2
+    variance: FloatArray = config.walk_m2_per_m * way_m + config.rate2 * way_m**2
     return variance

@@ -71,7 +71,7 @@ def ties_to_prior(
         shift_m, covariance = found
         if covariance is None:
             continue
-        bend = graph.drift_m_per_sqrt_km**2 / 1000.0 * side_m / 12.0
+        bend = graph.walk_m2_per_m * side_m / 12.0
         fixes.append(
             KeyframeFix(
                 keyframe=k,

@@ -24,6 +24,9 @@ from perception.records import ElevationStrip, FloatArray, Grid, Progress
 
 # More than two gain little: gathering is short and the rest holds the lock.
 _THREADS = 2
+# What is expected of any shift beneath what the graph can know, 1-sigma an axis: beams, rocking, the floor that
+# places echoes.
+LEAST_SHIFT_M = 0.5
 # Cells of the floor that places echoes: some hundred bytes each while passes are fused. At a sixth of an
 # altitude of 15 m they are 25 km2, and at the width it is smoothed to, 0.4 altitudes, 140 km2.
 _FLOOR_CELLS = 4_000_000
@@ -170,16 +173,14 @@ def expected_shift(
     low, high = sorted((first, second))
     way = keyframes.way_m[low + 1 : high + 1]
     if np.isfinite(way).all():
-        walk = config.drift_m_per_sqrt_km**2 * way.sum() / 1000.0
+        walk = config.walk_m2_per_m * way.sum()
         jump = (keyframes.jump_m[low + 1 : high + 1] ** 2).sum()
         steps = np.hypot(
             np.diff(keyframes.easting_m[low : high + 1]),
             np.diff(keyframes.northing_m[low : high + 1]),
         )
         by_pass = np.bincount(keyframes.strip[low:high] - keyframes.strip[low], weights=steps)
-        rate = config.scale**2 + np.radians(config.heading_bias_deg) ** 2
-        between = (walk + jump + rate * (by_pass**2).sum()) * np.eye(2)
+        between = (walk + jump + config.rate2 * (by_pass**2).sum()) * np.eye(2)
         if not np.isfinite(both).all() or np.trace(between) < np.trace(both):
             both = between
-    floor = np.eye(2) * 0.25
-    return np.where(np.isfinite(both), both, 1e4 * np.eye(2)) + floor
+    return np.where(np.isfinite(both), both, 1e4 * np.eye(2)) + LEAST_SHIFT_M**2 * np.eye(2)

@@ -18,7 +18,7 @@ from mapping.placing import at_lines, bridge, on_track
 from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, solve
 from mapping.pose_graph_relative import relative_covariance
 from mapping.prior_tie import ties_to_prior
-from mapping.rounds import Registration, TextureStore, ends_of, register
+from mapping.rounds import LEAST_SHIFT_M, Registration, TextureStore, ends_of, register
 from mapping.sharing import solve_shared
 from mapping.survey_check import check, least_square_m, square_cell_m, swath_width
 from mapping.textures import MatchConfig, default_cell, thinned
@@ -202,17 +202,23 @@ def correct_survey(
     given = _Given(
         thin, keyframes, ties, TextureStore(thin, config.match), width_m, cell_m, config, floor, progress
     )  # fmt: skip
-    if known is None:
-        squares, state = config.squares, _State(solve(keyframes, (), ties, config.graph))
-    else:
-        squares = config.squares[-1:]
-        state = _State(
-            known.solution, known.diagnostics.rounds, known.registrations,
-            tuple(zip(known.squares, known.links, strict=True)),
-            _trusted(known.links, known.solution.link_used),
-            _trusted(known.steps, known.solution.step_used),
-        )  # fmt: skip
-    settled_m = config.settled_m or 0.2 * cell_m
+    state = _rounds(given, known)
+    chosen = apart(state.pool)
+    links = [link for _, link in chosen]
+    # Without links too: where the graph refused every one, the last round's solution still names them.
+    solution = solve_shared(keyframes, links, ties, config.graph, state.steps)
+    return assemble(
+        strips, keyframes, solution, state.found, links, [w for w, _ in chosen], ties, state.steps,
+        state.rounds, config,
+    )  # fmt: skip
+
+
+def _rounds(given: _Given, known: CorrectedSurvey | None) -> _State:
+    """Compare narrowing squares until they pay no more; of a survey that is known the last ones only."""
+    config = given.config
+    squares = config.squares if known is None else config.squares[-1:]
+    state = _begun(given, known)
+    settled_m = config.settled_m or 0.2 * given.cell_m
     for number in range(config.rounds or len(squares)):
         last = number >= len(squares) - 1
         part = squares[min(number, len(squares) - 1)]
@@ -227,16 +233,18 @@ def correct_survey(
                 break
         if not state.found or (number >= len(squares) and state.rounds[-1].moved_m < settled_m):
             break
-    chosen = apart(state.pool)
-    links = [link for _, link in chosen]
-    if links or state.rounds:
-        # Without links too: where the graph refused every one, the last round's solution still names them.
-        solution = solve_shared(keyframes, links, ties, config.graph, state.steps)
-    else:
-        solution = state.solution
-    return assemble(
-        strips, keyframes, solution, state.found, links, [w for w, _ in chosen], ties, state.steps,
-        state.rounds, config,
+    return state
+
+
+def _begun(given: _Given, known: CorrectedSurvey | None) -> _State:
+    """Return what is known before the first round."""
+    if known is None:
+        return _State(solve(given.keyframes, (), given.ties, given.config.graph))
+    return _State(
+        known.solution, known.diagnostics.rounds, known.registrations,
+        tuple(zip(known.squares, known.links, strict=True)),
+        _trusted(known.links, known.solution.link_used),
+        _trusted(known.steps, known.solution.step_used),
     )  # fmt: skip
 
 
@@ -305,7 +313,7 @@ def _within_reach(
     relative = relative_covariance(
         given.keyframes, state.solution, state.links, ties, state.steps, pairs
     )
-    expected = _CAUTION**2 * relative + _LEAST_SHIFT_M**2 * np.eye(2)
+    expected = _CAUTION**2 * relative + LEAST_SHIFT_M**2 * np.eye(2)
     unknown = ~np.isfinite(expected).all(axis=(1, 2))
     expected[unknown] = given.config.widest_search_m**2 * np.eye(2)
     joined = np.isfinite(given.keyframes.way_m) & ~(given.keyframes.jump_m > 0)
@@ -316,10 +324,6 @@ def _within_reach(
     return _trusted(windows, reached), {
         _place(w): covariance for w, covariance in zip(windows, expected, strict=True)
     }
-
-
-# Beneath what the graph can know: beams, rocking, the floor that places echoes. [m]
-_LEAST_SHIFT_M = 0.5
 
 
 def _worth_comparing(
@@ -415,10 +419,9 @@ def assemble(
 ) -> CorrectedSurvey:
     """Put a solved graph into the survey's own terms: strips on their track, poses with covariance."""
     corrected = on_track(strips, keyframes, solution)
-    q2 = config.graph.drift_m_per_sqrt_km**2 / 1000.0
     covariances = []
     for index, strip in enumerate(strips):
-        between = q2 * bridge(strip, index, keyframes)
+        between = config.graph.walk_m2_per_m * bridge(strip, index, keyframes)
         covariance = at_lines(strip, index, keyframes, solution.covariance_m2)
         covariances.append(covariance + between[:, None, None] * np.eye(2))
     covariance = np.concatenate(covariances)
