@@ -15,9 +15,10 @@ from matplotlib.colors import LightSource, Normalize
 from matplotlib.patheffects import withStroke
 
 from perception.files import whole_file
-from perception.records import FloatArray, bilinear
+from perception.records import FloatArray
 from planning.coverage import Survey
 from planning.failure import Blockage
+from planning.ground import SurfaceGround
 from planning.planner import Plan
 from planning.route import Route
 from planning.surface import Surface
@@ -71,12 +72,10 @@ def _picture_route(path: Path, plan: Plan, route: Route) -> None:
     bottom = z - route.altitude_m
     limits = surface.limits
     _draw_profile(lower, s, bottom, z, limits.floor_m, limits.ceiling_m)
-    row, col = (local / size for local, size in zip(
-        reversed(surface.local(route.easting_m, route.northing_m)), reversed(surface.cell_m), strict=True
-    ))  # fmt: skip
+    least, _, _ = SurfaceGround(surface, weighted=False).at(route.easting_m, route.northing_m)
     lower.fill_between(
-        s, bottom + limits.floor_m, bilinear(surface.lower_m, row, col), color="orange", alpha=0.5,
-        lw=0, label=f"kept clear besides: {plan.k:.2f} sigma, objects",
+        s, bottom + limits.floor_m, least, color="orange", alpha=0.5, lw=0,
+        label=f"kept clear besides: {plan.k:.2f} sigma, objects",
     )  # fmt: skip
     _legends(figure, upper, lower)
     at = int(

@@ -71,6 +71,15 @@ class Asked:
     more: dict[str, Any]
 
 
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """What else bears on the ground, read once and asked of any grid of the map; each gives None without a file."""
+
+    forbidden: Callable[[Grid], BoolArray | None]
+    position_sigma: Callable[[Grid], FloatArray | None]
+    obstacles: Callable[[Grid], Obstacles | None]
+
+
 def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked:
     """Read the map and all that bears on it, for a route from start to goal."""
     from mapping.rasters import read_map
@@ -85,10 +94,12 @@ def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked
     else:
         grid = read_map(given.map_path, given.map_sigma)
     _tell_of_sigma(given, grid, limits)
-    _tell_of_dry_ground(given, grid)
-    problem = posed(given, grid, from_true_north(limits, grid, given.start, given.goal), None)
-    if reduced is None:
-        # Of block means the ends are judged at full resolution, later.
+    beside = read_beside(given, grid)
+    limits = from_true_north(limits, grid, given.start, given.goal)
+    problem = posed(given, grid, limits, None, beside)
+    _tell_of_dry_ground(given, problem)
+    if reduced is None and given.regions is None and given.region_weights != "none":
+        # Before the segmentation, which takes longest. Of block means the ends are judged at full resolution, later.
         check_ends(problem, (given.start, *given.via, given.goal))
     began = time.perf_counter()
     problem = replace(problem, weight=_weights(grid, given, reduced))
@@ -96,18 +107,15 @@ def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked
     if reduced is None:
         return Asked(problem, None, more)
     problem = replace(problem, submerged=not reduced.lowest_m > 0)
-    asked_of_windows = (
-        no_go(given.avoid, grid.crs),
-        position_sigma(given.position_sigma, given.map_path),
-        standing(given.objects, grid),
-    )
     if given.error_correlation is None:
         # Ten cells as stored, not ten blocks: fewer patches would take k for smaller than it is.
         problem = replace(problem, correlation_m=10.0 * max(reduced.cell_m))
     more |= {"reduced_cell_m": grid.cell_m, "map_cells": cells}
-    return Asked(
-        problem, FullMap(given.map_path, given.map_sigma, reduced, *asked_of_windows), more
-    )
+    full = FullMap(
+        given.map_path, given.map_sigma, reduced, beside.forbidden, beside.position_sigma,
+        beside.obstacles,
+    )  # fmt: skip
+    return Asked(problem, full, more)
 
 
 def check_ends(problem: Problem, stops: tuple[tuple[float, float] | None, ...]) -> None:
@@ -121,7 +129,18 @@ def check_ends(problem: Problem, stops: tuple[tuple[float, float] | None, ...]) 
             end_node(surface, stop, name)
 
 
-def posed(given: Given, grid: Grid, limits: VehicleLimits, weight: FloatArray | None) -> Problem:
+def read_beside(given: Given, grid: Grid) -> Beside:
+    """Read no-go areas, expected position error and objects; `grid` is the whole map or what is held of it."""
+    return Beside(
+        no_go(given.avoid, grid.crs),
+        position_sigma(given.position_sigma, given.map_path),
+        standing(given.objects, grid),
+    )
+
+
+def posed(
+    given: Given, grid: Grid, limits: VehicleLimits, weight: FloatArray | None, beside: Beside
+) -> Problem:
     """Return the problem on a grid that is held."""
     from planning.cost import read_terms
     from planning.current_files import read_currents
@@ -132,9 +151,9 @@ def posed(given: Given, grid: Grid, limits: VehicleLimits, weight: FloatArray | 
         limits=limits,
         terms=read_terms(given.cost_path),
         weight=weight,
-        forbidden=no_go(given.avoid, grid.crs)(grid),
-        obstacles=standing(given.objects, grid)(grid),
-        position_sigma_m=position_sigma(given.position_sigma, given.map_path)(grid),
+        forbidden=beside.forbidden(grid),
+        obstacles=beside.obstacles(grid),
+        position_sigma_m=beside.position_sigma(grid),
         currents=read_currents(given.currents, grid) if given.currents else None,
         risk=given.risk,
         correlation_m=math.nan if given.error_correlation is None else given.error_correlation,
@@ -166,7 +185,7 @@ def read_around(
     weight = None
     if given.old_route is not None:
         weight = _weights(grid, given, None)
-    problem = posed(given, grid, limits, weight)
+    problem = posed(given, grid, limits, weight, read_beside(given, grid))
     if large and not problem.under_water():
         # What was read lies on dry ground; whether all of the map does, only the rest of it tells.
         problem = replace(problem, submerged=not is_dry(given.map_path))
@@ -195,11 +214,9 @@ def _tell_of_sigma(given: Given, grid: Grid, limits: VehicleLimits) -> None:
         )  # fmt: skip
 
 
-def _tell_of_dry_ground(given: Given, grid: Grid) -> None:
+def _tell_of_dry_ground(given: Given, problem: Problem) -> None:
     """Warn where a map has no ground under water: heights may be depths, counted downwards."""
-    import numpy as np
-
-    if np.nanmin(grid.elevation_m) > 0:
+    if not problem.under_water():
         logger.warning(
             "%s: all its heights lie above zero, so it is taken for dry ground without a water surface; if they are "
             "depths, turn them: gdal_calc.py -A MAP.tif --calc=-A", given.map_path,
