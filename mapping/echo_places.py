@@ -5,6 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from perception.interpolation import cell_height
 from perception.records import ElevationStrip, FloatArray, Grid
 
 
@@ -60,12 +61,4 @@ def _height(floor: FloatArray, frame: FloatArray, east: float, north: float) -> 
     if not (0.0 <= row <= rows - 1 and 0.0 <= col <= cols - 1):
         return np.nan
     r, c = min(int(row), max(rows - 2, 0)), min(int(col), max(cols - 2, 0))
-    fr, fc = row - r, col - c
-    height = 0.0
-    for dr in range(2):
-        for dc in range(2):
-            weight = (fr if dr else 1.0 - fr) * (fc if dc else 1.0 - fc)
-            # A neighbour of zero weight must not spread its NaN to a place that does not need it.
-            if weight > 0.0:
-                height += weight * floor[r + dr, c + dc]
-    return height
+    return cell_height(floor, r, c, row, col)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from perception.interpolation import cell_height
 from perception.records import FloatArray
 
 
@@ -38,21 +39,6 @@ class Extremes:
         bad = np.flatnonzero(np.isnan(self.least_m))
         index = int(bad[0]) if len(bad) else int(np.argmin(self.least_m))
         return index, float(self.least_at[index])
-
-
-@njit(cache=True)
-def _cell_height(surface, row0, col0, row, col):  # type: ignore[no-untyped-def]
-    """Bilinear height with corner (row0, col0); a NaN corner of zero weight does not count."""
-    fr, fc = row - row0, col - col0
-    total = 0.0
-    for i in range(2):
-        for j in range(2):
-            weight = (fr if i else 1.0 - fr) * (fc if j else 1.0 - fc)
-            if weight > 0.0:
-                r = min(row0 + i, surface.shape[0] - 1)
-                c = min(col0 + j, surface.shape[1] - 1)
-                total += weight * surface[r, c]
-    return total
 
 
 @njit(cache=True)
@@ -97,7 +83,7 @@ def segment_extremes(surface, row_a, col_a, z_a, row_b, col_b, z_b):  # type: ig
             # Crossings are clamped into the cell: rounding must not fetch a corner across a line.
             row = min(max(row_a + u * d_row, row0), row0 + 1.0)
             col = min(max(col_a + u * d_col, col0), col0 + 1.0)
-            g[i] = z_a + u * d_z - _cell_height(surface, row0, col0, row, col)
+            g[i] = z_a + u * d_z - cell_height(surface, row0, col0, row, col)
         if math.isnan(g[0]) or math.isnan(g[1]) or math.isnan(g[2]):
             return nan, t, nan, t
         for i in (0, 2):
