@@ -6,7 +6,7 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,16 @@ logger = logging.getLogger(__name__)
 
 _SIGMA_NAMES = ("sigma", "uncertainty", "std", "stddev", "standard deviation")
 _ELEVATION_NAMES = ("elevation", "bathymetry", "height", "z", "topo", "depth")
+# What makers write for "no data" and forget to declare; no sea floor stands at these to the digit.
+_SENTINELS = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0)
+# Deeper than any sea and higher than any mountain: no height, whatever it stands for.
+_IMPOSSIBLE_M = 12_000.0
+# Metres in a unit of height; the survey foot differs from the foot by two parts in a million.
+_UNITS_M = {
+    "ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "us-ft": 1200 / 3937, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937,
+    "fathom": 1.8288, "fathoms": 1.8288, "cm": 0.01, "centimetre": 0.01, "centimeter": 0.01, "mm": 0.001, "dm": 0.1,
+    "km": 1000.0,
+}  # fmt: skip
 
 
 def read_map(path: Path, sigma_m: float | None = None) -> Grid:
@@ -76,6 +86,8 @@ class OpenMap:
     down : whether the band of heights holds depths.
     sigma_m : 1-sigma that the caller gave for the whole map; None takes the file's.
     sigma_beside : name of another variable of the same NetCDF that holds the sigma; empty none.
+    unit_m : metres in the file's unit of height, and of sigma.
+    told : kinds of defects already told of, so that a map read by windows tells of each once.
     """
 
     path: Path
@@ -86,6 +98,8 @@ class OpenMap:
     count_band: int | None
     sigma_m: float | None
     sigma_beside: str
+    unit_m: float = 1.0
+    told: set[str] = field(default_factory=set)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -118,21 +132,21 @@ class OpenMap:
         if rows is not None and cols is not None:
             window = Window(cols.start, rows.start, cols.stop - cols.start, rows.stop - rows.start)
             west, north = west + cols.start * transform.a, north + rows.start * transform.e
-        elevation_m = _read_band(self.source, self.elevation_band, window)
+        elevation_m = self._without_sentinels(
+            _read_band(self.source, self.elevation_band, window) * self.unit_m
+        )
         if self.down:
             elevation_m = -elevation_m
         sigma: npt.NDArray[np.float64] | None = None
         if self.sigma_m is not None:
             sigma = np.where(np.isfinite(elevation_m), float(self.sigma_m), np.nan)
         elif self.sigma_band is not None:
-            sigma = _read_band(self.source, self.sigma_band, window)
+            sigma = _read_band(self.source, self.sigma_band, window) * self.unit_m
         elif self.sigma_beside:
             with rasterio.open(self.sigma_beside) as beside:
-                sigma = _read_band(beside, 1, window)
+                sigma = _read_band(beside, 1, window) * self.unit_m
         if sigma is not None and (sigma < 0).any():
-            logger.warning(
-                "%s: holds negative sigmas (%g): taken for unknown", self.path, np.nanmin(sigma)
-            )
+            self._tell_once("sigma", f"holds negative sigmas ({np.nanmin(sigma):g}): taken for unknown")
             sigma = np.where(sigma < 0, np.nan, sigma)
         square = np.isclose(transform.a, -transform.e, rtol=1e-9)
         return Grid(
@@ -148,6 +162,22 @@ class OpenMap:
             else _read_band(self.source, self.count_band, window),
             datum=self.source.tags().get("VERTICAL_DATUM", ""),
         )
+
+    def _without_sentinels(self, elevation_m: FloatArray) -> FloatArray:
+        """Return heights with NaN for what stands for no data without being declared as such."""
+        wrong = np.abs(elevation_m) > _IMPOSSIBLE_M
+        if self.source.nodatavals[self.elevation_band - 1] is None:
+            wrong |= np.isin(elevation_m, np.array(_SENTINELS) * self.unit_m)
+        if not wrong.any():
+            return elevation_m
+        values = ", ".join(f"{v / self.unit_m:g}" for v in np.unique(elevation_m[wrong])[:3])
+        self._tell_once("no data", f"cells of {values} are no heights: taken for no data")
+        return np.where(wrong, np.nan, elevation_m)
+
+    def _tell_once(self, kind: str, defect: str) -> None:
+        if kind not in self.told:
+            self.told.add(kind)
+            logger.warning("%s: %s", self.path, defect)
 
 
 def _horizontal(crs: Any) -> str:
@@ -188,7 +218,21 @@ def _opened(source: Any, path: Path, sigma_m: float | None) -> OpenMap:
         count_band=_band_named(descriptions, ("count",)),
         sigma_m=sigma_m,
         sigma_beside="" if sigma_band is not None else _sibling_sigma(source, path),
+        unit_m=_unit_of_height(source, elevation_band, path),
     )
+
+
+def _unit_of_height(source: Any, band: int, path: Path) -> float:
+    """Return the metres in a file's unit of height: by its band, its tags or its vertical CRS."""
+    tags = {k.rsplit("#", 1)[-1].lower(): v for k, v in source.tags(band).items()}
+    name = str(source.units[band - 1] or tags.get("units", "") or tags.get("unittype", "")).strip()
+    unit_m = _UNITS_M.get(name.lower().replace("_", " "), 1.0)
+    if not name and source.crs and source.crs.to_wkt().startswith("COMPD"):
+        axis = CRS.from_wkt(source.crs.to_wkt()).sub_crs_list[-1].axis_info[0]
+        name, unit_m = axis.unit_name, axis.unit_conversion_factor
+    if unit_m != 1.0:
+        logger.warning("%s: its heights are in %s: turned to metres", path, name)
+    return unit_m
 
 
 def _descriptions(source: Any) -> list[str]:

@@ -68,6 +68,39 @@ def test_a_band_of_depth_is_turned_over_and_nodata_is_nan(tmp_path: Path) -> Non
     assert np.isnan(grid.sigma_m[2, 3]) and grid.sigma_m[0, 0] == 0.3
 
 
+@pytest.mark.parametrize("value", [-9999.0, -32768.0, 3.4e38])
+def test_a_value_for_no_data_that_the_file_does_not_declare_is_no_height(
+    tmp_path: Path, value: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    values = np.full((10, 12), -25.0)
+    values[2:4, 3] = value
+    grid = read_map(write_raw(tmp_path / "m.tif", values, NORTH_UP, "EPSG:32630"))
+    assert np.isnan(grid.elevation_m[2:4, 3]).all() and np.isfinite(grid.elevation_m).sum() == 118
+    assert len(caplog.messages) == 1 and "taken for no data" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("unit", "crs", "metres"),
+    [
+        ("ft", "EPSG:32630", 0.3048),
+        ("US survey foot", "EPSG:32630", 1200 / 3937),
+        ("m", "EPSG:32630", 1.0),
+        ("", "EPSG:32630+6360", 1200 / 3937),  # NAVD88 height (ftUS)
+        ("", "EPSG:32630+5703", 1.0),
+    ],
+)
+def test_heights_in_feet_are_turned_to_metres_and_told_of(
+    tmp_path: Path, unit: str, crs: str, metres: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_raw(tmp_path / "m.tif", np.full((4, 5), -100.0), NORTH_UP, crs)
+    if unit:
+        with rasterio.open(path, "r+") as target:
+            target.set_band_unit(1, unit)
+    grid = read_map(path)
+    np.testing.assert_allclose(grid.elevation_m, -100.0 * metres)
+    assert ("turned to metres" in caplog.text) == (metres != 1.0)
+
+
 @pytest.mark.parametrize(
     ("transform", "crs", "said"),
     [
