@@ -18,7 +18,7 @@ def write_rounds(path: Path, rounds: Sequence[Round]) -> None:
     lines = [_HEADER]
     for number, r in enumerate(rounds, start=1):
         lines.append(
-            f"{number},{r.floor},{r.square_m:.2f},{r.compared},{r.accepted},{r.used},"
+            f"{number},{r.floor},{r.square_m:.2f},{r.compared},{r.accepted},{r.used},{r.beyond},"
             f"{r.evidence:.3f},{r.moved_m:.4f},{r.error_before:.3f},{r.error_after:.3f}"
         )
     write_text(path, "\n".join(lines) + "\n")
