@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +20,17 @@ if TYPE_CHECKING:
 
 # A log is told of a long step this often.
 _LINE_SECONDS = 15.0
+
+
+class FiniteRange(click.FloatRange):
+    """A number within bounds; click's own range takes `nan` and `inf` for numbers of any range."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        if not math.isfinite(number := click.FLOAT.convert(value, param, ctx)):
+            self.fail(f"{value} is no number to reckon with.", param, ctx)
+        return float(super().convert(number, param, ctx))
 
 
 def common_options(command: Callable[..., Any]) -> Callable[..., Any]:

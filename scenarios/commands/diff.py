@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from scenarios.commands.console import (
+    FiniteRange,
     common_options,
     out_option,
     prepare_out,
@@ -21,14 +22,14 @@ from scenarios.commands.console import (
 @out_option
 @click.option(
     "--beyond",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     default=3.0,
     show_default=True,
     help="Combined sigmas beyond which a patch of cells counts as changed.",
 )
 @click.option(
     "--position-sigma",
-    type=click.FloatRange(min=0),
+    type=FiniteRange(min=0),
     default=1.0,
     show_default=True,
     help="1-sigma of either survey's track, m (contacts of folders).",

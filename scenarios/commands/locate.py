@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from scenarios.commands.console import (
+    FiniteRange,
     common_options,
     prepare_out,
     print_table,
@@ -22,17 +23,17 @@ from scenarios.commands.console import (
 @click.option("--nav", type=click.Path(path_type=Path), help="Navigation with ranges: nav.csv.")
 @click.option("--swath", multiple=True, type=click.Path(path_type=Path), help="Side-scan file of the same voyage; may be repeated.")  # fmt: skip
 @click.option("--sensors", type=click.Path(path_type=Path), help="Beam directions and noise (TOML).")  # fmt: skip
-@click.option("--map-sigma", type=click.FloatRange(min=0, min_open=True), help="1-sigma of the map, m; else its band, else IHO S-44 Order 1a.")  # fmt: skip
-@click.option("--map-error-length", type=click.FloatRange(min=0), help="Correlation length of the map's error, m; else what its spectrum tells.")  # fmt: skip
+@click.option("--map-sigma", type=FiniteRange(min=0, min_open=True), help="1-sigma of the map, m; else its band, else IHO S-44 Order 1a.")  # fmt: skip
+@click.option("--map-error-length", type=FiniteRange(min=0), help="Correlation length of the map's error, m; else what its spectrum tells.")  # fmt: skip
 @click.option("--particles", type=click.IntRange(200, 200_000), default=4000, show_default=True, help="Particles of the search.")  # fmt: skip
 @click.option(
     "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the search."
 )
 @click.option("--observability", is_flag=True, help="Map where terrain can fix a vehicle, and how well; needs --map only.")  # fmt: skip
-@click.option("--altitude", type=click.FloatRange(min=0, min_open=True), default=50.0, show_default=True, help="Altitude for --observability, m.")  # fmt: skip
-@click.option("--path", "path_m", type=click.FloatRange(min=1), default=300.0, show_default=True, help="Length of track for --observability, m.")  # fmt: skip
+@click.option("--altitude", type=FiniteRange(min=0, min_open=True), default=50.0, show_default=True, help="Altitude for --observability, m.")  # fmt: skip
+@click.option("--path", "path_m", type=FiniteRange(min=1), default=300.0, show_default=True, help="Length of track for --observability, m.")  # fmt: skip
 @click.option("--patch", type=click.Path(path_type=Path), help="Raster of sea floor to place anywhere in the map, in its own axes.")  # fmt: skip
-@click.option("--heading", type=click.FloatRange(-360.0, 360.0), help="Azimuth of the patch's own north, degrees, where it is known (to 0.5 degrees); else every heading is tried.")  # fmt: skip
+@click.option("--heading", type=FiniteRange(-360.0, 360.0), help="Azimuth of the patch's own north, degrees, where it is known (to 0.5 degrees); else every heading is tried.")  # fmt: skip
 @click.option("--compact", is_flag=True, help="Place --patch by a hundredth of the map's bytes: its hills, hollows and a thumbnail.")  # fmt: skip
 @click.option("--follow", is_flag=True, help="Read rows (CSV or JSON lines) from standard input, write estimates as they come.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from scenarios.commands.console import (
+    FiniteRange,
     common_options,
     out_option,
     prepare_out,
@@ -27,13 +27,6 @@ if TYPE_CHECKING:
     from perception.installation import Installation
     from perception.readers import Survey
     from perception.records import Grid, Progress
-
-
-def _finite(ctx: click.Context, param: click.Parameter, value: float | None) -> float | None:
-    """Refuse a number that is none: click takes `nan` and `inf` for numbers of any range."""
-    if value is not None and not math.isfinite(value):
-        raise click.BadParameter(f"{value} is no length; give metres, as {param.opts[0]} 0.5")
-    return value
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +79,7 @@ class _Tiling:
 @out_option
 @click.option(
     "--cell",
-    type=click.FloatRange(min=0, min_open=True),
-    callback=_finite,
+    type=FiniteRange(min=0, min_open=True),
     help="Cell of the map, m.",
 )
 @click.option("--crs", help="Projected CRS in metres (EPSG:N); default the data's UTM zone.")
@@ -107,8 +99,7 @@ class _Tiling:
 @click.option(
     "--fill",
     "fill_m",
-    type=click.FloatRange(min=0, min_open=True, max=1000),
-    callback=_finite,
+    type=FiniteRange(min=0, min_open=True, max=1000),
     help="Fill gaps up to so many metres from data, marked in a band `filled`.",
 )
 @click.option(

@@ -11,6 +11,7 @@ import click
 
 from perception.records import InputError, NoOverlapError
 from scenarios.commands.console import (
+    FiniteRange,
     common_options,
     out_option,
     prepare_out,
@@ -62,9 +63,21 @@ class Position(click.ParamType):  # type: ignore[type-arg]
     default="",
     help="'none', or a TOML file with [weights]; without: H-K weights.",
 )
-@click.option("--map-sigma", type=float, help="1-sigma of the map, m, instead of its band.")
-@click.option("--risk", type=float, default=0.01, show_default=True, help="Of breaking the floor.")
-@click.option("--error-correlation", type=float, help="Length over which map errors hold, m.")
+@click.option(
+    "--map-sigma", type=FiniteRange(min=0), help="1-sigma of the map, m, instead of its band."
+)
+@click.option(
+    "--risk",
+    type=FiniteRange(0, 1, min_open=True, max_open=True),
+    default=0.01,
+    show_default=True,
+    help="Of breaking the floor.",
+)
+@click.option(
+    "--error-correlation",
+    type=FiniteRange(min=0, min_open=True),
+    help="Length over which map errors hold, m.",
+)
 @click.option(
     "--position-sigma",
     type=click.Path(path_type=Path),
@@ -84,15 +97,31 @@ class Position(click.ParamType):  # type: ignore[type-arg]
 @click.option(
     "--survey", type=click.Path(path_type=Path), help="Cover this area (vector file) with lines."
 )
-@click.option("--swath", type=float, default=60.0, show_default=True, help="Of a survey line, m.")
 @click.option(
-    "--overlap", type=float, default=0.2, show_default=True, help="Of neighbouring swaths."
+    "--swath",
+    type=FiniteRange(min=0, min_open=True),
+    default=60.0,
+    show_default=True,
+    help="Of a survey line, m.",
 )
 @click.option(
-    "--crossings", type=int, default=2, show_default=True, help="Survey lines square to the others."
+    "--overlap",
+    type=FiniteRange(0, 1, max_open=True),
+    default=0.2,
+    show_default=True,
+    help="Of neighbouring swaths.",
+)
+@click.option(
+    "--crossings",
+    type=click.IntRange(min=0),
+    default=2,
+    show_default=True,
+    help="Survey lines square to the others.",
 )
 @click.option("--replan", "old_route", type=click.Path(path_type=Path), help="route.csv under way.")
-@click.option("--travelled", type=float, default=0.0, help="Metres of it behind the vehicle.")
+@click.option(
+    "--travelled", type=FiniteRange(min=0), default=0.0, help="Metres of it behind the vehicle."
+)
 @click.option("--planner", type=click.Choice(PLANNERS), default="bitstar", show_default=True)
 @click.option(
     "--space",
@@ -101,7 +130,7 @@ class Position(click.ParamType):  # type: ignore[type-arg]
     show_default=True,
     help="That OMPL plans in: along the best guide, or without one.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of OMPL.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of OMPL.")
 @click.option("--picture/--no-picture", default=True, show_default=True, help="Draw route.png.")
 @common_options
 def command(out: Path, quiet: bool, verbose: bool, picture: bool, **options: Any) -> None:
@@ -155,20 +184,3 @@ def _refuse_mixed(given: Given) -> None:
         )
     if given.planner == "fmt" and given.space != "corridor":
         raise click.UsageError("--planner fmt plans in --space corridor only")
-    for name, value in (
-        ("--swath", given.swath),
-        ("--overlap", given.overlap),
-        ("--travelled", given.travelled),
-    ):
-        if not math.isfinite(value):
-            raise click.UsageError(f"{name} must be a number, got {value:g}")
-    if given.seed < 0:
-        raise click.UsageError(f"--seed must be 0 or more, got {given.seed}")
-    if not 0 < given.risk < 1:
-        raise click.UsageError(f"--risk must lie between 0 and 1, got {given.risk:g}")
-    if given.map_sigma is not None and not 0 <= given.map_sigma < math.inf:
-        raise click.UsageError(f"--map-sigma must be 0 or more, got {given.map_sigma:g}")
-    if given.error_correlation is not None and not 0 < given.error_correlation < math.inf:
-        raise click.UsageError(
-            f"--error-correlation must be more than 0 m, got {given.error_correlation:g}"
-        )

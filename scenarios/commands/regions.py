@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from scenarios.commands.console import (
+    FiniteRange,
     common_options,
     out_option,
     prepare_out,
@@ -28,17 +29,19 @@ if TYPE_CHECKING:
 @click.option(
     "--scale",
     "scale_m",
-    type=float,
+    type=FiniteRange(min=0),
     help="Smoothing for the whole map (Gaussian sigma, m); chosen per cell if left out.",
 )
-@click.option("--detail", "detail_m", type=float,
+@click.option("--detail", "detail_m", type=FiniteRange(min=0),
               help="Least scale of the classes, m; 0 the finest, else chosen to give regions of use.")  # fmt: skip
-@click.option("--window", "window_m", type=float,
+@click.option("--window", "window_m", type=FiniteRange(min=0, min_open=True),
               help="Fit a quadratic over boxes of this width, m, instead of smoothing.")  # fmt: skip
 @click.option("--method", type=click.Choice(["auto", "difference", "least-squares", "box"]),
               default="auto", show_default=True,
               help="Scale chosen per cell, bare 3 x 3 cells (two ways), or boxes (--window).")  # fmt: skip
-@click.option("--map-sigma", "map_sigma_m", type=float, help="1-sigma of the heights, m.")
+@click.option(
+    "--map-sigma", "map_sigma_m", type=FiniteRange(min=0), help="1-sigma of the heights, m."
+)
 @click.option("--levels", type=click.IntRange(1, 8), default=1, show_default=True,
               help="Levels of detail; each coarser one doubles the scale.")  # fmt: skip
 @click.option("--objects", "objects_path", type=click.Path(path_type=Path),
@@ -74,14 +77,11 @@ def command(
     from mapping.rasters import read_map
     from mapping.region_files import write_segmentation
     from perception.background import lift_objects
-    from perception.records import InputError
     from perception.regions import segment
     from scenarios.outputs import write_metrics
     from scenarios.plots_regions import plot_legend, plot_regions
 
     set_verbosity(quiet, verbose)
-    if map_sigma_m is not None and not map_sigma_m >= 0:
-        raise InputError(f"--map-sigma must be zero or more metres, got {map_sigma_m}")
     grid = read_map(map_path, map_sigma_m)
     config = _config(grid, method, scale_m, detail_m, window_m, levels)
     prepare_out(out)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from scenarios.commands.console import common_options, set_verbosity
+from scenarios.commands.console import FiniteRange, common_options, set_verbosity
 
 _FRAMES_A_SECOND = 10
 
@@ -16,7 +16,7 @@ _FRAMES_A_SECOND = 10
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option(
-    "--seconds", default=12.0, show_default=True, type=click.FloatRange(min=0.1), help="Length."
+    "--seconds", default=12.0, show_default=True, type=FiniteRange(min=0.1), help="Length."
 )
 @common_options
 def command(folder: Path, seconds: float, quiet: bool, verbose: bool) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from scenarios.commands.console import (
+    FiniteRange,
     common_options,
     out_option,
     prepare_out,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 @click.option("--crs", help="Projected CRS in metres (EPSG:N); default the data's UTM zone.")
 @click.option(
     "--cell",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     help="Columns of a strip, m; default two samples.",
 )
 @click.option("--install", type=click.Path(path_type=Path), help="Lever arms and mounting, TOML.")

@@ -1,12 +1,13 @@
 """What every command shares: the output folder."""
 
 import click
+import pytest
 from click.testing import CliRunner
 
 from perception.records import InputError
 from scenarios.commands import scenarios as scenarios_command
 from scenarios.commands import sensors as sensors_command
-from scenarios.commands.console import out_option, prepare_out, progress_lines
+from scenarios.commands.console import FiniteRange, out_option, prepare_out, progress_lines
 
 
 @click.command()
@@ -53,3 +54,10 @@ def test_a_pipe_is_told_of_long_steps_only_and_what_is_left_of_them(capsys):
         "joint inversion: 2 of 4 after 19 s, about 19 s left",
         "writing: 0 of 2",
     ]
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "0", "-1"])
+def test_a_length_that_is_no_number_or_out_of_bounds_is_wrong_usage(value):
+    with pytest.raises(click.BadParameter):
+        FiniteRange(min=0, min_open=True).convert(value, None, None)
+    assert FiniteRange(min=0).convert("2.5", None, None) == 2.5
