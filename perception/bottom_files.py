@@ -2,7 +2,8 @@
 
 Columns: `time` (ISO 8601 UTC, or seconds of the file's clock), `pass`, `ping` (in the order of the survey's
 files), `slant_range_m` (the first return), `altitude_m`, `sigma_m`, `flag` (`seen`, `carried`, `given`).
-Given back, a row replaces what the tracker found for its ping; a ping without a row, or with an empty
+Given back, `altitude_m` rules (a first return longer than it is cut to it), `time` proves that the file belongs to the
+survey, and a row replaces what the tracker found for its ping; a ping without a row, or with an empty
 altitude, is interpolated between its neighbours.
 """
 
@@ -20,6 +21,8 @@ from perception.bottom import BottomTrack
 from perception.files import existing_file, write_text
 from perception.records import BoolArray, FloatArray, InputError, IntArray, Swath
 
+# Rows this far from their pings in time belong to another record; clocks corrected otherwise differ by less.
+_OTHER_RECORD_S = 10.0
 _COLUMNS = ("time", "pass", "ping", "slant_range_m", "altitude_m", "sigma_m", "flag")
 
 
@@ -37,6 +40,7 @@ class GivenBottom:
     seen: BoolArray = field(compare=False, repr=False)
     source: str
     digest: str
+    time_s: FloatArray = field(compare=False, repr=False, default_factory=lambda: np.empty(0))
 
     def __hash__(self) -> int:
         return hash(self.digest)
@@ -47,7 +51,7 @@ class GivenBottom:
         Raises
         ------
         InputError
-            No row for any ping of the pass, or an altitude beyond its range.
+            No row for any ping of the pass, an altitude beyond its range, or times of another record.
         """
         found = np.clip(np.searchsorted(self.ping, swath.ping), 0, len(self.ping) - 1)
         there = self.ping[found] == swath.ping
@@ -58,6 +62,7 @@ class GivenBottom:
                 f"{self.source}: no altitude for any ping of pass {swath.pass_index} (pings "
                 f"{swath.ping[0]} to {swath.ping[-1]}); give rows for some, or drop --bottom"
             )
+        self._refuse_other_record(swath, found, known)
         range_m = np.asarray(swath.sample_m, float) * swath.n_samples
         if np.any(altitude[known] >= range_m[known]):
             ping = int(swath.ping[known][np.argmax(altitude[known] >= range_m[known])])
@@ -82,6 +87,18 @@ class GivenBottom:
             valid=known & there & self.seen[found],
         )
 
+    def _refuse_other_record(self, swath: Swath, row: IntArray, known: BoolArray) -> None:
+        """Refuse a file whose rows were taken at other times than the pings that they number."""
+        if not len(self.time_s):
+            return
+        apart = np.abs(self.time_s[row] - swath.time_s)[known]
+        apart = apart[np.isfinite(apart)]
+        if len(apart) and np.median(apart) > _OTHER_RECORD_S:
+            raise InputError(
+                f"{self.source}: its rows for pass {swath.pass_index} are {np.median(apart):.0f} s away from the "
+                "pings they number: it belongs to another record, or the files were named in another order"
+            )
+
 
 def read_bottom(path: Path) -> GivenBottom:
     """Read a bottom track; `ping` and `altitude_m` are needed, the other columns may lack.
@@ -100,26 +117,44 @@ def read_bottom(path: Path) -> GivenBottom:
             raise InputError(
                 f"{path}: lacks the column {name}; edit the bottom.csv that strips wrote"
             )
-    values = [
-        [_number(path, rows.line_num, name, row.get(name))
-         for name in ("ping", "slant_range_m", "altitude_m", "sigma_m")]
-        + [float(row.get("flag") != "carried")]
-        for row in rows
-    ]  # fmt: skip
+    values, times = [], []
+    for row in rows:
+        numbers = [
+            _number(path, rows.line_num, name, row.get(name))
+            for name in ("ping", "slant_range_m", "altitude_m", "sigma_m")
+        ]
+        values.append([*numbers, float(row.get("flag") != "carried")])
+        times.append(_seconds(row.get("time")))
     if not values:
         raise InputError(f"{path}: holds no row; edit the bottom.csv that strips wrote")
     table = np.array(values, float)
     if np.isnan(table[:, 0]).any():
         raise InputError(f"{path}: a row has no ping number; each altitude belongs to a ping")
-    table = table[np.argsort(table[:, 0], kind="stable")]
+    order = np.argsort(table[:, 0], kind="stable")
+    table, time_s = table[order], np.array(times, float)[order]
     ping = table[:, 0].astype(np.int64)
     twice = np.flatnonzero(np.diff(ping) == 0)
     if len(twice):
         raise InputError(f"{path}: ping {ping[twice[0]]} has two rows; keep one")
     digest = hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
     return GivenBottom(
-        ping, table[:, 1], table[:, 2], table[:, 3], table[:, 4] > 0, path.name, digest
+        ping, table[:, 1], table[:, 2], table[:, 3], table[:, 4] > 0, path.name, digest, time_s
     )
+
+
+def _seconds(text: str | None) -> float:
+    """Return a time in seconds since 1970, or of the file's clock; NaN where it is neither."""
+    text = (text or "").strip().removesuffix("Z")
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        stamp = np.datetime64(text, "ms")
+    except ValueError:
+        return float("nan")
+    # numpy takes an empty text for no time, and that for a number far in the past.
+    return float("nan") if np.isnat(stamp) else float(stamp.astype(np.int64)) / 1000.0
 
 
 def _number(path: Path, line: int, name: str, text: str | None) -> float:

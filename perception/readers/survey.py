@@ -19,7 +19,7 @@ from perception.geodesy import (
 )
 from perception.passes import PassConfig, Track, split_passes
 from perception.readers.compass import compass_warning, heading_offsets
-from perception.readers.raw import PingFlag, RawFile, plural
+from perception.readers.raw import PingFlag, RawFile, plural, spread_rows
 from perception.readers.repair import mend_clock, mend_headings, mend_positions
 from perception.records import BoolArray, FloatArray, InputError, IntArray, Swath
 
@@ -109,6 +109,7 @@ class Survey:
         """Bring scanned files into one frame, mend what can be mended, split into passes."""
         defects: list[str] = []
         warnings: list[str] = []
+        files = _without_twins(files, warnings)
         _refuse_without_pings(files)
         target = _target_crs(files, crs, warnings)
         tables = []
@@ -249,6 +250,31 @@ def _target_crs(files: Sequence[RawFile], crs: str | None, warnings: list[str]) 
 
 def _names(files: Sequence[RawFile]) -> str:
     return ", ".join(str(raw.path) for raw in files)
+
+
+def _without_twins(files: Sequence[RawFile], warnings: list[str]) -> list[RawFile]:
+    """Leave out records that are there already: counted twice, one pass would pass for two that agree."""
+    kept: list[RawFile] = []
+    for raw in files:
+        twin = next((other for other in kept if _same_record(raw, other)), None)
+        if twin is None:
+            kept.append(raw)
+        else:
+            warnings.append(f"{raw.path.name}: is the record of {twin.path.name} again: left out")
+    return kept
+
+
+def _same_record(one: RawFile, other: RawFile) -> bool:
+    """Return whether two files hold the same pings; two frequencies of one dive share all but their echoes."""
+    n = len(one.pings)
+    if n == 0 or n != len(other.pings):
+        return False
+    for name in ("time_s", "x", "y", "range_m"):
+        if not np.array_equal(getattr(one.pings, name), getattr(other.pings, name), equal_nan=True):
+            return False
+    rows, width = spread_rows(n, 8), int(max(one.pings.samples.max(), other.pings.samples.max()))
+    mine, theirs = one.samples(rows, width), other.samples(rows, width)
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(mine, theirs, strict=True))
 
 
 def _refuse_without_pings(files: Sequence[RawFile]) -> None:

@@ -131,6 +131,10 @@ def test_a_bottom_of_another_survey_or_beyond_range_is_refused(tmp_path: Path) -
     path.write_text("ping,altitude_m\n1,10\n2,99\n")
     with pytest.raises(InputError, match=r"ping 2 is beyond its range of 30\.0 m"):
         build_strip(swath, StripConfig(given_bottom=read_bottom(path)))
+    later = replace(swath, time_s=swath.time_s + 3600.0)
+    _written(swath, path)
+    with pytest.raises(InputError, match=r"3600 s away .* another record"):
+        build_strip(later, StripConfig(given_bottom=read_bottom(path)))
     moved = replace(swath, ping=swath.ping + 1000)
     with pytest.raises(InputError, match="no altitude for any ping of pass 0"):
         build_strip(moved, StripConfig(given_bottom=read_bottom(path)))

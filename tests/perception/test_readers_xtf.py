@@ -441,6 +441,18 @@ def test_two_files_are_one_survey_in_the_order_given(tmp_path):
     assert survey.swath(1).ping[0] == 30 and survey.swath(1).n_pings == 40
 
 
+def test_a_record_given_twice_counts_once_and_is_told(tmp_path):
+    first = make_xtf(tmp_path / "a.xtf", Plan(n=40))
+    copy = tmp_path / "b.xtf"
+    copy.write_bytes(first.read_bytes())
+    for paths in ([first, first], [first, copy]):
+        survey = open_survey(paths)
+        assert survey.n_pings == 40 and survey.n_passes == 1
+        assert any("again: left out" in text for text in survey.warnings)
+    other = make_xtf(tmp_path / "c.xtf", Plan(n=40, seed=1))
+    assert open_survey([first, other]).n_pings == 80
+
+
 def test_files_that_continue_each_other_are_one_pass(tmp_path):
     plan = Plan(n=60)
     header, *packets = xtf_packets(plan)
