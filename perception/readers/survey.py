@@ -13,6 +13,7 @@ from perception.geodesy import (
     LOCAL_CRS,
     convergence,
     metric_crs,
+    scale_error,
     transform,
     utm_crs,
     wrap,
@@ -122,6 +123,7 @@ class Survey:
         if installation is not None:
             table = installation.apply(table, all(raw.utc for raw in files))
         _refuse_unusable(files, table)
+        _check_scale(files, table, target, warnings)
         if not np.isfinite(table.depth_m).any():
             warnings.append(
                 "depth is unknown or zero throughout: elevations are relative to the sonar"
@@ -202,6 +204,8 @@ class Survey:
         )
 
 
+# A grid's metres may differ from true ones by this part before it is told, and before it is refused.
+_SCALE_TOLD, _SCALE_REFUSED = 0.005, 0.02
 _SHARED = {f.name for f in fields(PingTable)}
 
 
@@ -246,6 +250,23 @@ def _target_crs(files: Sequence[RawFile], crs: str | None, warnings: list[str]) 
         f"{_names(files)}: none of {plural(sum(len(raw.pings) for raw in files), 'ping')} has a valid "
         "position (all zero or NaN); give a file with navigation"
     )
+
+
+def _check_scale(
+    files: Sequence[RawFile], table: PingTable, target: str, warnings: list[str]
+) -> None:
+    """Refuse a CRS whose metres are none where the survey lies: ranges are true metres, and would not fit."""
+    middle = (float(np.nanmedian(table.easting_m)), float(np.nanmedian(table.northing_m)))
+    off = float(scale_error(np.array(middle[:1]), np.array(middle[1:]), target)[0])
+    if not abs(off) > _SCALE_TOLD:
+        return
+    what = (
+        f"{_names(files)}: {target} is made for another place: its distances are {100 * off:+.1f} % "
+        "off where the survey lies; give --crs EPSG:N of the survey's own zone, or leave it out"
+    )
+    if abs(off) > _SCALE_REFUSED:
+        raise InputError(what)
+    warnings.append(what)
 
 
 def _names(files: Sequence[RawFile]) -> str:

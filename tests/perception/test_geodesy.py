@@ -13,6 +13,7 @@ from perception.geodesy import (
     convergence,
     is_local,
     metric_crs,
+    scale_error,
     transform,
     utm_crs,
     wrap,
@@ -84,3 +85,18 @@ def test_a_crs_that_is_not_metric_is_refused_by_name(text, why):
     with pytest.raises(InputError, match=why) as caught:
         metric_crs(text)
     assert text in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("crs", "lon", "lat", "error"),
+    [
+        ("EPSG:32630", -3.0, 50.0, -0.0004),
+        ("EPSG:3857", 0.0, 60.0, 1.0),  # 1 / cos 60 deg, but for the ellipsoid
+        ("EPSG:32661", 20.0, 89.5, -0.006),
+        (LOCAL_CRS, 1.0, 2.0, 0.0),
+    ],
+)
+def test_the_scale_of_a_grid_against_its_definition(crs, lon, lat, error):
+    at = (np.array([lon]), np.array([lat]))
+    east, north = at if crs == LOCAL_CRS else transform(*at, GEOGRAPHIC, crs)
+    assert abs(scale_error(east, north, crs)[0] - error) < 1e-4 + 5e-3 * abs(error)

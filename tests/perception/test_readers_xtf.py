@@ -453,6 +453,14 @@ def test_a_record_given_twice_counts_once_and_is_told(tmp_path):
     assert open_survey([first, other]).n_pings == 80
 
 
+def test_a_grid_whose_metres_are_none_here_is_refused(tmp_path):
+    path = make_xtf(tmp_path / "a.xtf", Plan(n=40))
+    zone = open_survey([path]).crs
+    with pytest.raises(InputError, match=r"EPSG:3857 is made for another place: .* % off"):
+        open_survey([path], crs="EPSG:3857")
+    assert zone.startswith("EPSG:32") and not open_survey([path], crs=zone).warnings
+
+
 def test_files_that_continue_each_other_are_one_pass(tmp_path):
     plan = Plan(n=60)
     header, *packets = xtf_packets(plan)
