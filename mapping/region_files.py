@@ -23,6 +23,7 @@ from rasterio.transform import Affine
 from mapping.rasters import write_bands
 from mapping.region_style import CLASS_COLOURS as CLASS_COLOURS
 from mapping.region_style import qgis_style, raster_attributes, style_layers
+from mapping.vectors import Layer, put_layer
 from perception.curvature import Curvature
 from perception.files import existing_file, whole_file, write_text
 from perception.records import REGION_CLASSES, Grid, InputError, RegionMap
@@ -68,17 +69,8 @@ def _write_layers(
     with whole_file(path) as temporary:
         try:
             for k, (name, kind, geometries, columns) in enumerate(layers):
-                pyogrio.raw.write(
-                    temporary,
-                    shapely.to_wkb(geometries),
-                    field_data=list(columns.values()),
-                    fields=list(columns),
-                    crs=chain[0].crs or None,
-                    geometry_type=kind,
-                    driver="GPKG",
-                    layer=name,
-                    append=k > 0,
-                )
+                layer = Layer(geometries, columns, kind)
+                put_layer(temporary, name, layer, chain[0].crs, append=k > 0)
             style_layers(temporary, names)
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
             raise InputError(f"{path}: cannot be written ({error})") from error

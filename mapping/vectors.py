@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,19 +56,36 @@ def write_layers(path: Path, layers: Mapping[str, Layer], crs: str) -> None:
                 if driver == "GeoJSON" and crs:
                     # RFC 7946 knows WGS 84 only.
                     shapes, target_crs = to_lonlat(shapes, crs), "EPSG:4326"
-                pyogrio.raw.write(
+                put_layer(
                     temporary,
-                    shapely.to_wkb(shapes),
-                    field_data=[np.asarray(v) for v in layer.columns.values()],
-                    fields=list(layer.columns),
-                    crs=target_crs or None,
-                    geometry_type=layer.geometry_type,
-                    driver=driver,
-                    layer=name,
-                    append=number > 0,
+                    name,
+                    replace(layer, geometries=shapes),
+                    target_crs,
+                    driver,
+                    number > 0,
                 )
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
             raise InputError(f"{path}: cannot be written ({error})") from error
+
+
+def put_layer(
+    path: Path, name: str, layer: Layer, crs: str, driver: str = "GPKG", append: bool = False
+) -> None:
+    """Write one layer into a file that is being made."""
+    with warnings.catch_warnings():
+        # A map without a CRS is no surprise here: it was told when the map was made.
+        warnings.filterwarnings("ignore", message="'crs' was not provided")
+        pyogrio.raw.write(
+            path,
+            shapely.to_wkb(layer.geometries),
+            field_data=[np.asarray(v) for v in layer.columns.values()],
+            fields=list(layer.columns),
+            crs=crs or None,
+            geometry_type=layer.geometry_type,
+            driver=driver,
+            layer=name,
+            append=append,
+        )
 
 
 def to_lonlat(shapes: npt.NDArray[Any], crs: str) -> npt.NDArray[Any]:

@@ -73,11 +73,15 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Beside:
-    """What else bears on the ground, read once and asked of any grid of the map; each gives None without a file."""
+    """What else bears on the ground, read once and asked of any grid of the map; each gives None without a file.
+
+    `standing_objects` is the number of objects on the map that stand up; None without a file.
+    """
 
     forbidden: Callable[[Grid], BoolArray | None]
     position_sigma: Callable[[Grid], FloatArray | None]
     obstacles: Callable[[Grid], Obstacles | None]
+    standing_objects: int | None
 
 
 def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked:
@@ -104,6 +108,8 @@ def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked
     began = time.perf_counter()
     problem = replace(problem, weight=_weights(grid, given, reduced))
     more: dict[str, Any] = {"regions_s": time.perf_counter() - began}
+    if beside.standing_objects is not None:
+        more["standing_objects"] = beside.standing_objects
     if reduced is None:
         return Asked(problem, None, more)
     problem = replace(problem, submerged=not reduced.lowest_m > 0)
@@ -134,7 +140,7 @@ def read_beside(given: Given, grid: Grid) -> Beside:
     return Beside(
         no_go(given.avoid, grid.crs),
         position_sigma(given.position_sigma, given.map_path),
-        standing(given.objects, grid),
+        *standing(given.objects, grid),
     )
 
 
@@ -313,15 +319,17 @@ def no_go(path: Path | None, crs: str) -> Callable[[Grid], BoolArray | None]:
     return lambda grid: forbidden_cells(grid, polygons)
 
 
-def standing(path: Path | None, whole: Grid) -> Callable[[Grid], Obstacles | None]:
-    """Return what gives the objects that stand on a grid; None where no file is given.
+def standing(
+    path: Path | None, whole: Grid
+) -> tuple[Callable[[Grid], Obstacles | None], int | None]:
+    """Return what gives the objects that stand on a grid, and how many the map has; None where no file is given.
 
     Parameters
     ----------
     whole : the map, which names the CRS, and on which at least one object must lie.
     """
     if path is None:
-        return lambda grid: None
+        return lambda grid: None, None
     import numpy as np
 
     from mapping.object_layer import read_objects
@@ -346,7 +354,7 @@ def standing(path: Path | None, whole: Grid) -> Callable[[Grid], Obstacles | Non
         "%s: %d objects stand on the map, %d of them of unknown height", path, np.sum(hills),
         np.sum(hills & objects.least),
     )  # fmt: skip
-    return lambda grid: obstacles_on(grid, objects)
+    return lambda grid: obstacles_on(grid, objects), int(np.sum(hills))
 
 
 def _weights(grid: Grid, given: Given, reduced: Reduced | None) -> FloatArray | None:

@@ -107,8 +107,8 @@ def clearance_told(route: Route, floor_m: float, k: float) -> str:
     return f"nowhere less than {over}, proved, {more}"
 
 
-def tell_route(plan: Plan, seconds: float, out: Path) -> None:
-    """Print what the route is like."""
+def tell_route(plan: Plan, seconds: float, out: Path, objects: int | None = None) -> None:
+    """Print what the route is like; `objects` is the number that stand on the map, None where no list was given."""
     route = plan.route
     assert route is not None
     rows = [
@@ -118,6 +118,11 @@ def tell_route(plan: Plan, seconds: float, out: Path) -> None:
         ("altitude", f"mean {route.mean_altitude_m:.2f} m, least {route.min_altitude_m:.2f} m"),
         ("clearance", clearance_told(route, plan.surface.limits.floor_m, plan.k)),
         ("stand-off", f"{route.min_stand_off_m:.2f} m, the least slant distance to the ground"),
+        *(
+            []
+            if objects is None
+            else [("objects", f"{objects} standing on the map, held clear of")]
+        ),
         ("time", f"{seconds:.2f} s"),
         ("written", str(out / "route.csv")),
     ]

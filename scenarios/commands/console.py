@@ -18,6 +18,11 @@ from perception.records import InputError, Progress, silent
 if TYPE_CHECKING:
     from perception.readers import Survey
 
+# The file by which a folder is known for the results of a command.
+_MARKS = {
+    "strip-000.nc": "strips", "map.tif": "map", "regions.tif": "regions", "fixes.csv": "locate", "route.csv": "plan",
+    "survey.xtf": "simulate",
+}  # fmt: skip
 # A log is told of a long step this often.
 _LINE_SECONDS = 15.0
 
@@ -63,11 +68,13 @@ def set_verbosity(quiet: bool, verbose: bool) -> None:
 def prepare_out(out: Path) -> Path:
     """Make the output folder and prove that it can be written, before any work is done.
 
-    A command that fails leaves no empty folder of its own making behind.
+    A command that fails leaves no empty folder of its own making behind. Where another command's results lie
+    there already, a line on standard error tells that its metrics.json goes.
     """
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     context = click.get_current_context(silent=True)
     if context is not None:
+        _tell_of_other_results(out, str(context.info_name))
         context.call_on_close(lambda: _remove_empty(made))
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -80,6 +87,16 @@ def prepare_out(out: Path) -> Path:
             "give --out a folder that can be written"
         ) from error
     return out
+
+
+def _tell_of_other_results(out: Path, verb: str) -> None:
+    others = [maker for mark, maker in _MARKS.items() if maker != verb and (out / mark).exists()]
+    if others and (out / "metrics.json").exists():
+        click.echo(
+            f"note: {out}: holds results of {' and '.join(others)}; its metrics.json and config.toml are "
+            "written over; give each command a folder of its own",
+            err=True,
+        )
 
 
 def _remove_empty(folders: list[Path]) -> None:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyogrio
 import pytest
 import shapely
 
@@ -47,3 +48,9 @@ def test_metres_in_a_geojson_without_a_crs_are_not_taken_for_degrees(tmp_path: P
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
     with pytest.raises(InputError, match="no degrees"):
         read_polygons(path, CRS)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_layer_without_a_crs_is_written_without_a_word(tmp_path: Path) -> None:
+    write_layer(tmp_path / "a.gpkg", [shapely.Point(1, 2)], {"n": np.array([1])}, "", "Point")
+    assert pyogrio.read_info(tmp_path / "a.gpkg")["crs"] is None

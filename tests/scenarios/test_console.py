@@ -36,6 +36,15 @@ def test_a_folder_with_results_stays(tmp_path):
     assert (tmp_path / "out" / "result.txt").read_text() == "there"
 
 
+def test_results_of_another_command_in_the_folder_are_told_of(tmp_path):
+    for name in ("map.tif", "metrics.json"):
+        (tmp_path / name).write_text("")
+    told = CliRunner().invoke(working, ["--out", str(tmp_path)])
+    assert told.exit_code == 0 and "holds results of map" in told.stderr
+    (tmp_path / "map.tif").unlink()
+    assert "note" not in CliRunner().invoke(working, ["--out", str(tmp_path)]).stderr
+
+
 def test_lists_take_the_common_options():
     for module in (scenarios_command, sensors_command):
         assert CliRunner().invoke(module.command, ["-q"]).exit_code == 0

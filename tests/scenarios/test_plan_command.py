@@ -508,6 +508,7 @@ def test_objects_that_the_map_smooths_lift_the_route_and_count_in_the_metrics(ch
         )
     assert least["clear"] > least["plain"] + 3.0
     assert "objects.csv" in (tmp_path / "clear" / "config.toml").read_text()
+    assert json.loads((tmp_path / "clear" / "metrics.json").read_text())["standing_objects"] == 78
 
 
 def test_objects_of_another_place_are_refused(chart, tmp_path):
