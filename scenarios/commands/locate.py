@@ -60,13 +60,15 @@ def command(
 ) -> None:
     """Find the vehicle's position by comparing its ranges with a prior map.
 
+    Writes trajectory.csv, trajectory-smoothed.csv, fixes.csv, locate.png and metrics.json.
+
     \b
     Examples:
       bathynav locate --map prior.tif --nav nav.csv --out runs/locate
       bathynav locate --map chart.bag --map-sigma 0.3 --nav nav.csv --sensors dvl.toml --out runs/locate
       bathynav locate --map prior.tif --nav nav.csv --swath survey.xtf --out runs/locate
       bathynav locate --observability --map prior.tif --out runs/where
-      bathynav locate --patch strip.tif --map prior.tif --out runs/patch
+      bathynav locate --patch survey/map.tif --map prior.tif --out runs/patch
       tail -f nav.csv | bathynav locate --follow --map prior.tif
     """
     set_verbosity(quiet, verbose)

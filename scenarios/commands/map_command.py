@@ -129,6 +129,9 @@ class _Tiling:
 def command(surveys: tuple[Path, ...], out: Path, quiet: bool, verbose: bool, **given: Any) -> None:
     """Turn the passes in SURVEY files into one map with sigma and a corrected track.
 
+    Writes map.tif (elevation, sigma, count), trajectory.csv, mosaic.tif (echo), flags.tif, objects.gpkg and
+    contacts.html, tracks.gpkg, rounds.csv and graph files, pictures and metrics.json.
+
     \b
     bathynav map survey.xtf --out map --fixes surface-fixes.csv
     bathynav map lines/*.xtf --out map --tiles --cell 0.25 --also map.nc

@@ -136,6 +136,9 @@ class Position(click.ParamType):  # type: ignore[type-arg]
 def command(out: Path, quiet: bool, verbose: bool, picture: bool, **options: Any) -> None:
     """Plan a route that stays near the bottom and is proved clear of it.
 
+    Writes route.csv, .geojson, .gpkg, .gpx, .plan and .png, and metrics.json; without a route, blocked.png
+    and the reason.
+
     \b
     bathynav plan --map map.tif --start 512340,4101200 --goal 513020,4101950 --out plan
     bathynav plan --map map.tif --start E,N --goal E,N --via E,N --via E,N --out tour
