@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from mapping.comparison_memory import Circumstances, ComparisonMemory
 from mapping.fusion import default_cell as default_fusion_cell
 from mapping.fusion import fuse
 from mapping.keyframes import Keyframes
@@ -70,6 +71,7 @@ def register(
     progress: Progress,
     label: str,
     expected: FloatArray | None = None,
+    memory: ComparisonMemory | None = None,
 ) -> tuple[list[tuple[Window, Match]], list[Link]]:
     """Compare the passes over every window; return every comparison, and a link for each accepted one.
 
@@ -78,18 +80,23 @@ def register(
     corrected : the strips on the track of `solution`.
     floor : a map that tells where echoes came from; None what the strips' soundings say of it.
     expected : (windows, 2, 2) covariance of the shift expected beforehand; None what `expected_shift` says.
+    memory : of earlier comparisons; those that hold still are not made again.
     """
     if expected is None:
         expected = np.array(
             [expected_shift(keyframes, solution, *ends_of(keyframes, w), graph) for w in windows]
         )
     known = known_floor(corrected) if floor is None else floor
-    needed = sorted({index for w in windows for index in (w.first, w.second)})
+    given = Circumstances(windows, corrected, keyframes, solution, expected, known, cell_m)
+    recalled = {} if memory is None else memory.recall(given)
+    fresh = [i for i in range(len(windows)) if i not in recalled]
+    needed = sorted({i for n in fresh for i in (windows[n].first, windows[n].second)})
     with ThreadPoolExecutor(_THREADS) as pool:
-        made = pool.map(lambda index: textures.placed(index, corrected[index], known), needed)
-        placed = dict(zip(needed, made, strict=True))
+        ready = pool.map(lambda index: textures.placed(index, corrected[index], known), needed)
+        placed = dict(zip(needed, ready, strict=True))
 
-    def compare(window: Window, prior: FloatArray) -> Match:
+    def compare(number: int) -> Match:
+        window, prior = windows[number], expected[number]
         search_m = 3.0 * float(np.sqrt(np.linalg.eigvalsh(prior).max())) + 2.0 * cell_m
         return match(
             placed[window.first],
@@ -102,19 +109,24 @@ def register(
             prior,
         )
 
-    results: list[tuple[Window, Match]] = []
+    made = dict(recalled)
     # Transforms and gridding let go of the interpreter's lock; the order of results is that of the windows.
     with ThreadPoolExecutor(_THREADS) as pool:
-        for window, result in zip(windows, pool.map(compare, windows, expected), strict=True):
-            results.append((window, result))
-            progress(label, len(results), len(windows))
-    results = [(w, m) for (w, _), m in zip(results, believed([m for _, m in results]), strict=True)]
-    links = [
-        link_of(corrected, keyframes, solution, window, result, graph, floor)
-        for window, result in results
-        if result.accepted
-    ]
-    return results, links
+        for number, result in zip(fresh, pool.map(compare, fresh), strict=True):
+            made[number] = result
+            progress(label, len(made), len(windows))
+    matches = [made[number] for number in range(len(windows))]
+    if memory is not None:
+        memory.keep(given, recalled, matches)
+    results = list(zip(windows, believed(matches), strict=True))
+
+    def link(window: Window, result: Match) -> Link:
+        def make() -> Link:
+            return link_of(corrected, keyframes, solution, window, result, graph, floor)
+
+        return make() if memory is None else memory.link(window, cell_m, make)
+
+    return results, [link(window, result) for window, result in results if result.accepted]
 
 
 def ends_of(keyframes: Keyframes, window: Window) -> tuple[int, int]:

@@ -24,6 +24,15 @@ def square_cell_m(side_m: float, cell_m: float) -> float:
     return max(cell_m, side_m / _MOST_CELLS)
 
 
+def steady(length_m: float) -> float:
+    """Return a length to two digits: a pass more must not move the lattice of all squares by a hair's breadth.
+
+    >>> steady(95.996), steady(96.289), steady(0.4608)
+    (96.0, 96.0, 0.46)
+    """
+    return float(f"{length_m:.2g}")
+
+
 def check(strips: Sequence[ElevationStrip]) -> None:
     """Refuse strips that cannot be one survey.
 
