@@ -19,8 +19,9 @@ from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixe
 from mapping.link_choice import apart_numbers
 from mapping.overlaps import Window, find_overlaps
 from mapping.placing import on_track
-from mapping.pose_graph import HeightStep, Link, Solution, solve
+from mapping.pose_graph import HeightStep, Link, Solution
 from mapping.pose_graph_incremental import IncrementalGraph
+from mapping.pose_graph_solve import solve
 from mapping.registration import Match
 from mapping.rounds import Registration, TextureStore, register
 from mapping.survey import CorrectedSurvey, SurveyConfig, assemble

@@ -7,9 +7,8 @@ docs/pose-graph.md has the derivation.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gtsam as typed_gtsam
@@ -17,16 +16,16 @@ import numpy as np
 from gtsam.symbol_shorthand import B, E, G, H, M
 
 from mapping.keyframes import KeyframeFix, Keyframes
+from mapping.pose_graph_root import Root
 from perception.records import BoolArray, FloatArray
 
 # The stubs of the wheel know neither KeyVector arguments nor overloads by noise model.
 gtsam: Any = typed_gtsam
 
-logger = logging.getLogger(__name__)
 
 # The tie between a keyframe and the ground that it saw is exact; a centimetre is below any registration and
 # keeps the system well-conditioned beside a start that is free by a hundred metres.
-_TIE_M = 1e-2
+TIE_M = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +128,7 @@ class Solution:
     error_before, error_after : the graph's error (half a chi-square) over what was used.
     indeterminate, worsened : the graph does not determine the answer; the answer is no better.
     config : what was assumed.
+    root : what all covariances can be had from; None where the graph is indeterminate or was not solved as a whole.
     """
 
     correction_m: FloatArray
@@ -145,81 +145,12 @@ class Solution:
     indeterminate: bool
     worsened: bool
     config: GraphConfig
+    root: Root | None = field(default=None, repr=False, compare=False)
 
 
 def perpendicular(vector: FloatArray) -> FloatArray:
     """Return the change of (east, north) vectors (..., 2) per radian of clockwise turn."""
     return np.stack([vector[..., 1], -vector[..., 0]], axis=-1)
-
-
-def solve(
-    keyframes: Keyframes,
-    links: Sequence[Link] = (),
-    fixes: Sequence[KeyframeFix] = (),
-    config: GraphConfig | None = None,
-    robust: bool = True,
-    steps: Sequence[HeightStep] = (),
-) -> Solution:
-    """Solve the survey's graph; wrong registrations and fixes are found by graduated non-convexity.
-
-    Parameters
-    ----------
-    robust : False takes every registration and fix at its word.
-    """
-    config = config or GraphConfig()
-    graph, values, doubtful = build(keyframes, links, fixes, config, steps)
-    used = np.ones(len(doubtful), bool)
-    if robust and doubtful:
-        used = _consistent(graph, values, doubtful, config)
-    kept = _without(graph, [f for f, ok in zip(doubtful, used, strict=True) if not ok])
-    result = gtsam.GaussNewtonOptimizer(kept, values, gauss_newton()).optimize()
-    before, after = kept.error(values), kept.error(result)
-    marginals, indeterminate = _marginals(kept, result)
-    n_links = len(links)
-    logger.info(
-        "pose graph: %d keyframes, %d of %d registrations used, error %.1f -> %.1f",
-        len(keyframes),
-        int(used[:n_links].sum()),
-        n_links,
-        before,
-        after,
-    )
-    cov = None if marginals is None else marginals.marginalCovariance
-    return solution_of(
-        keyframes,
-        result.atVector,
-        cov,
-        config,
-        link_used=used[:n_links],
-        fix_used=used[n_links + len(steps) :],
-        step_used=used[n_links : n_links + len(steps)],
-        error_before=before,
-        error_after=after,
-        indeterminate=indeterminate,
-    )
-
-
-def log_evidence(
-    keyframes: Keyframes,
-    links: Sequence[Link],
-    fixes: Sequence[KeyframeFix],
-    config: GraphConfig,
-    steps: Sequence[HeightStep] = (),
-) -> float:
-    """Return the log-probability of the data under `config`, all unknowns integrated out, but for a constant.
-
-    Of the noise models' own determinants only the one that `GraphConfig.shared` changes is counted. NaN
-    where the graph does not determine its unknowns.
-    """
-    graph, values, _ = build(keyframes, links, fixes, config, steps)
-    result = gtsam.GaussNewtonOptimizer(graph, values, gauss_newton()).optimize()
-    try:
-        half_log_det = float(graph.linearize(result).eliminateMultifrontal().logDeterminant())
-    except RuntimeError:
-        return float("nan")
-    chained = int(_same_dive(keyframes).sum()) if config.shared else 0
-    half_of_priors = -1.5 * chained * np.log(1.0 - config.shared**2)
-    return float(half_of_priors - graph.error(result) - half_log_det)
 
 
 def solution_of(
@@ -312,18 +243,18 @@ def add_passes(
     white = np.linalg.inv(np.linalg.cholesky((1.0 - kept**2) * covariance))
     unit = gtsam.noiseModel.Unit.Create(3)
     height = gtsam.noiseModel.Isotropic.Sigma(1, config.height_m)
-    same_dive = _same_dive(keyframes)
+    chained = same_dive(keyframes)
     for p in range(first, len(keyframes.starts) - 1):
         values.insert(B(p), np.zeros(3))
         values.insert(H(p), np.zeros(1))
-        if kept and same_dive[p]:
+        if kept and chained[p]:
             graph.add(_linear((B(p - 1), -kept * white), (B(p), white), unit))
         else:
             graph.add(gtsam.PriorFactorVector(B(p), np.zeros(3), errors))
         graph.add(gtsam.PriorFactorVector(H(p), np.zeros(1), height))
 
 
-def _same_dive(keyframes: Keyframes) -> BoolArray:
+def same_dive(keyframes: Keyframes) -> BoolArray:
     """Return (p,) which passes follow the one before in the same dive."""
     return np.isfinite(keyframes.way_m[keyframes.starts[:-1]])
 
@@ -365,7 +296,7 @@ def add_odometry(
 
 def add_link(graph: Any, values: Any, keyframes: Keyframes, link: Link, number: int) -> int:
     """Add the two patches of ground and the registration between them; return its factor's index."""
-    tie = gtsam.noiseModel.Isotropic.Sigma(2, _TIE_M)
+    tie = gtsam.noiseModel.Isotropic.Sigma(2, TIE_M)
     ends = (
         (link.first, link.first_blend, link.first_offset_m),
         (link.second, link.second_blend, link.second_offset_m),
@@ -400,7 +331,7 @@ def _mean_correction(graph: Any, values: Any, blend: Blend | None, number: int) 
             (E(blend.low), (blend.share - 1.0) * np.eye(2)),
             (E(blend.high), -blend.share * np.eye(2)),
             (mean, np.eye(2)),
-            gtsam.noiseModel.Isotropic.Sigma(2, _TIE_M),
+            gtsam.noiseModel.Isotropic.Sigma(2, TIE_M),
         )
     )
     return int(mean)
@@ -418,49 +349,9 @@ def _linear(*terms: Any) -> Any:
     return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*flat, np.zeros(rows), noise), at)
 
 
-def _consistent(graph: Any, values: Any, doubtful: list[int], config: GraphConfig) -> BoolArray:
-    """Return which doubtful factors agree with the rest (truncated least squares by GNC)."""
-    once = gauss_newton()
-    # The graph is linear: one step is the solution, and a second would only prove it.
-    once.setMaxIterations(1)
-    # How convex GNC begins is told by the worst misfit of its start: of all factors' joint solution, as Yang
-    # et al. have it, and not of no correction at all, from where a drift of tens of metres costs thrice the rounds.
-    values = gtsam.GaussNewtonOptimizer(graph, values, once).optimize()
-    parameters = gtsam.GncGaussNewtonParams(once)
-    # Odometry and ties are linear factors of one noise each, which GNC then leaves alone.
-    parameters.setAllowNonNoiseModelFactors(True)
-    doubted = set(doubtful)
-    parameters.setKnownInliers([f for f in range(graph.size()) if f not in doubted])
-    optimizer = gtsam.GncGaussNewtonOptimizer(graph, values, parameters)
-    optimizer.setInlierCostThresholdsAtProbability(1.0 - config.outlier_probability)
-    optimizer.optimize()
-    weights = np.asarray(optimizer.getWeights())
-    return np.asarray(weights[doubtful] > 0.5)
-
-
 def gauss_newton() -> Any:
     """Return the parameters of the solver."""
     parameters = gtsam.GaussNewtonParams()
     # Cholesky squares the condition number, and weights of 1 cm stand beside some of 300 m.
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
     return parameters
-
-
-def _without(graph: Any, dropped: Sequence[int]) -> Any:
-    if not dropped:
-        return graph
-    kept, gone = gtsam.NonlinearFactorGraph(), set(dropped)
-    for index in range(graph.size()):
-        if index not in gone:
-            kept.add(graph.at(index))
-    return kept
-
-
-def _marginals(graph: Any, values: Any) -> tuple[Any, bool]:
-    """Return the marginals, or None where the graph does not determine every unknown."""
-    try:
-        return gtsam.Marginals(graph, values), False
-    except RuntimeError as error:
-        # GTSAM's optimizers return quietly on such a graph; its marginals say so.
-        logger.warning("the pose graph is indeterminate: %s", str(error).strip().splitlines()[0])
-        return None, True

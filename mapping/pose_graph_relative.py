@@ -6,94 +6,50 @@ looks at one place may lie is that relative uncertainty, and it is what a regist
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import SuperLU, splu
+from gtsam.symbol_shorthand import E
 
-from mapping.keyframes import KeyframeFix, Keyframes
-from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, build
+from mapping.pose_graph import Solution
+from mapping.pose_graph_root import Root
 from perception.records import FloatArray, IntArray
 
-# Keyframes whose columns of the covariance are solved for, at most, and columns solved for together.
-_MOST_ANCHORS, _TOGETHER = 400, 64
+# Of so many different keyframes whole columns of the covariance are taken.
+_MOST_COLUMNS = 200
+# Of more, the covariances are those of so many draws: each sigma is then known to 4 %.
+_DRAWS = 256
+# Pairs whose draws are held at once.
+_TOGETHER = 2000
 
 
-def relative_covariance(
-    keyframes: Keyframes,
-    solution: Solution,
-    links: Sequence[Link],
-    fixes: Sequence[KeyframeFix],
-    steps: Sequence[HeightStep],
-    pairs: IntArray,
-) -> FloatArray:
+def relative_covariance(solution: Solution, pairs: IntArray) -> FloatArray:
     """Return the (n, 2, 2) covariance of the difference of two keyframes' corrections, for (n, 2) pairs.
 
-    ``cov(a - b) = C_aa + C_bb - C_ab - C_ba``; the first two are the solution's own, for the others the graph's
-    information matrix is factorised once and solved for the columns of each a. Of more than some hundred
-    different a, neighbours share the column of one among them, and the walk between is added.
-
-    Parameters
-    ----------
-    solution : of the graph of exactly these links, fixes and steps, all of them believed.
+    ``cov(a - b) = C_aa + C_bb - C_ab - C_ba``. The columns C of some hundred a cost little, those of thousands more than
+    the solution itself; there it is the mean square of the same differences in draws from the
+    solution's distribution (from a fixed seed: a survey's answer repeats). NaN where the graph knows nothing.
     """
-    if not len(pairs):
-        return np.zeros((0, 2, 2))
-    graph, values, _ = build(keyframes, links, fixes, solution.config, steps)
-    factor = _factor(graph.linearize(values))
-    start = 3 * (len(keyframes.starts) - 1)
-    anchors = _anchors(keyframes, pairs[:, 0])
-    own = solution.covariance_m2
-    out: FloatArray = own[anchors] + own[pairs[:, 1]]
-    different = np.unique(anchors)
-    for begin in range(0, len(different), _TOGETHER):
-        group = different[begin : begin + _TOGETHER]
-        unit = np.zeros((factor.shape[0], 2 * len(group)))
-        unit[
-            start + 2 * np.repeat(group, 2) + np.tile([0, 1], len(group)), np.arange(2 * len(group))
-        ] = 1.0
-        columns = factor.solve(unit)
-        for n in np.flatnonzero(np.isin(anchors, group)):
-            row, col = start + 2 * int(pairs[n, 1]), 2 * int(np.searchsorted(group, anchors[n]))
-            cross = columns[row : row + 2, col : col + 2]
-            out[n] -= cross + cross.T
-    return out + _walked(keyframes, anchors, pairs[:, 0], solution.config)[:, None, None] * np.eye(
-        2
-    )
+    if solution.root is None or not len(pairs):
+        return np.full((len(pairs), 2, 2), np.nan)
+    root = solution.root
+    at = root.positions(E(k) for k in range(len(solution.correction_m)))
+    different = np.unique(pairs[:, 0])
+    if len(different) <= _MOST_COLUMNS:
+        return _by_columns(root, at, solution.covariance_m2, pairs, different)
+    drawn = root.draws(_DRAWS, np.random.default_rng(0))[at]
+    out = np.empty((len(pairs), 2, 2))
+    for begin in range(0, len(pairs), _TOGETHER):
+        chosen = pairs[begin : begin + _TOGETHER]
+        apart = drawn[chosen[:, 0]] - drawn[chosen[:, 1]]
+        out[begin : begin + _TOGETHER] = apart @ apart.transpose(0, 2, 1) / _DRAWS
+    return out
 
 
-def _factor(linear: Any) -> SuperLU:
-    """Return the factorised information matrix of a linear graph, variables in the order of their keys."""
-    row, col, value = np.asarray(linear.sparseJacobian_())
-    # One-based, and the last column is the right-hand side.
-    row, col = row.astype(int) - 1, col.astype(int) - 1
-    size = int(col.max())
-    left = col < size
-    jacobian = sparse.csc_matrix((value[left], (row[left], col[left])), shape=(row.max() + 1, size))
-    return splu(
-        (jacobian.T @ jacobian).tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-    )
-
-
-def _anchors(keyframes: Keyframes, wanted: IntArray) -> IntArray:
-    """Return for each keyframe itself, or where there are too many one near it in its own pass."""
-    if len(np.unique(wanted)) <= _MOST_ANCHORS:
-        return wanted
-    passes = keyframes.strip[wanted]
-    low, high = keyframes.starts[passes], keyframes.starts[passes + 1] - 1
-    # As many to each pass, in the middles of equal stretches.
-    stretches = max(1, _MOST_ANCHORS // len(np.unique(passes)))
-    wide = (high - low) // stretches + 1
-    return np.clip(low + (wanted - low) // wide * wide + wide // 2, low, high)
-
-
-def _walked(
-    keyframes: Keyframes, one: IntArray, other: IntArray, config: GraphConfig
+def _by_columns(
+    root: Root, at: IntArray, own: FloatArray, pairs: IntArray, different: IntArray
 ) -> FloatArray:
-    """Return the variance (m2, an axis) of the walk between keyframes of one pass."""
-    along_m = np.cumsum(np.nan_to_num(keyframes.way_m))
-    way_m = np.abs(along_m[one] - along_m[other])
-    variance: FloatArray = config.walk_m2_per_m * way_m + config.rate2 * way_m**2
-    return variance
+    columns = root.columns(at[different].ravel()).reshape(-1, len(different), 2)
+    which = np.searchsorted(different, pairs[:, 0])
+    # (n, 2, 2): the rows of b in the columns of a.
+    cross = columns[at[pairs[:, 1]], which[:, None]]
+    covariance: FloatArray = own[pairs[:, 0]] + own[pairs[:, 1]] - cross - np.swapaxes(cross, 1, 2)
+    return covariance

@@ -15,7 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from mapping.keyframes import KeyframeFix, Keyframes
-from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, log_evidence, solve
+from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution
+from mapping.pose_graph_solve import log_evidence, solve
 
 logger = logging.getLogger(__name__)
 

@@ -9,18 +9,20 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mapping.comparison_memory import ComparisonMemory
 from mapping.crossings import height_steps
 from mapping.fixes import PositionFix
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
 from mapping.link_choice import apart, enough
 from mapping.overlaps import Window, find_overlaps
 from mapping.placing import at_lines, bridge, on_track
-from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, solve
+from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution
 from mapping.pose_graph_relative import relative_covariance
+from mapping.pose_graph_solve import solve
 from mapping.prior_tie import ties_to_prior
 from mapping.rounds import LEAST_SHIFT_M, Registration, TextureStore, ends_of, register
 from mapping.sharing import solve_shared
-from mapping.survey_check import check, least_square_m, square_cell_m, swath_width
+from mapping.survey_check import check, least_square_m, square_cell_m, steady, swath_width
 from mapping.textures import MatchConfig, default_cell, thinned
 from perception.records import (
     BoolArray,
@@ -153,6 +155,7 @@ class _Given:
     config: SurveyConfig
     floor: Grid | None
     progress: Progress
+    memory: ComparisonMemory | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +177,7 @@ def correct_survey(
     progress: Progress = silent,
     floor: Grid | None = None,
     known: CorrectedSurvey | None = None,
+    memory: ComparisonMemory | None = None,
 ) -> CorrectedSurvey:
     """Correct the tracks of a survey by what its passes saw twice and by absolute fixes.
 
@@ -186,6 +190,8 @@ def correct_survey(
         what the strips' own soundings say of it.
     known : what an earlier call made of the same strips; then only the last, smallest squares are compared
         anew.
+    memory : of the comparisons of earlier calls, on fewer passes of the same survey. Those that hold still are not
+        made again; it keeps those that are made.
 
     Raises
     ------
@@ -194,13 +200,14 @@ def correct_survey(
     """
     config = config or SurveyConfig()
     check(strips)
-    width_m = swath_width(strips)
+    width_m = steady(swath_width(strips))
     keyframes = choose_keyframes(strips, config.keyframe_m or width_m / 12.0)
     ties = tie_fixes(fixes, strips, keyframes, config.graph.drift_m_per_sqrt_km)
     cell_m = config.match.cell_m or default_cell(strips)
     thin = [thinned(strip, 0.6 * cell_m) for strip in strips]
     given = _Given(
-        thin, keyframes, ties, TextureStore(thin, config.match), width_m, cell_m, config, floor, progress
+        thin, keyframes, ties, TextureStore(thin, config.match), width_m, steady(cell_m), config, floor,
+        progress, memory,
     )  # fmt: skip
     state = _rounds(given, known)
     chosen = apart(state.pool)
@@ -262,7 +269,7 @@ def _round(
         corrected, given.textures, keyframes, state.solution, windows,
         square_cell_m(side_m, given.cell_m), config.match, config.graph, config.widest_search_m,
         given.floor, given.progress, f"registering, round {len(state.rounds) + 1}",
-        np.array([expected[_place(w)] for w in windows]),
+        np.array([expected[_place(w)] for w in windows]), given.memory,
     )  # fmt: skip
     steps = height_steps(corrected, keyframes, state.solution, links)
     after = solve(keyframes, links, given.ties, config.graph, steps=steps)
@@ -308,11 +315,8 @@ def _within_reach(
     jumps, the graph expects nothing, though most begin with a fix of their own: they are searched as far as
     the search goes.
     """
-    ties = _trusted(given.ties, state.solution.fix_used)
     pairs = np.array([ends_of(given.keyframes, w) for w in windows], np.int64).reshape(-1, 2)
-    relative = relative_covariance(
-        given.keyframes, state.solution, state.links, ties, state.steps, pairs
-    )
+    relative = relative_covariance(state.solution, pairs)
     expected = _CAUTION**2 * relative + LEAST_SHIFT_M**2 * np.eye(2)
     unknown = ~np.isfinite(expected).all(axis=(1, 2))
     expected[unknown] = given.config.widest_search_m**2 * np.eye(2)

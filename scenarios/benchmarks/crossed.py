@@ -22,7 +22,8 @@ from scipy import stats
 from mapping.fixes import PositionFix, read_fixes
 from mapping.keyframes import Keyframes, tie_fixes
 from mapping.overlaps import find_overlaps
-from mapping.pose_graph import Link, solve
+from mapping.pose_graph import Link
+from mapping.pose_graph_solve import solve
 from mapping.rasters import read_map
 from mapping.survey import CorrectedSurvey, correct_survey
 from mapping.trajectories import read_trajectory

@@ -12,8 +12,9 @@ import numpy as np
 from mapping.graph_files import read_g2o
 from mapping.gridding import Spacing, Window, bin_lines
 from mapping.keyframes import Keyframes
-from mapping.pose_graph import GraphConfig, Link, build, gauss_newton, solve
+from mapping.pose_graph import GraphConfig, Link, build, gauss_newton
 from mapping.pose_graph_sets import dead_reckoned, gtsam_factors, gtsam_values, optimise
+from mapping.pose_graph_solve import solve
 from mapping.registration import match
 from mapping.textures import texture
 from perception.records import ElevationStrip, FloatArray, Progress

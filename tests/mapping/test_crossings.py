@@ -9,7 +9,8 @@ import pytest
 
 from mapping.crossings import height_steps
 from mapping.keyframes import choose_keyframes
-from mapping.pose_graph import GraphConfig, solve
+from mapping.pose_graph import GraphConfig
+from mapping.pose_graph_solve import solve
 from perception.records import ElevationStrip
 from tests.mapping.worlds import Drift, crossed_legs, fly, make_world
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from mapping.incremental import IncrementalSurvey
-from mapping.pose_graph import GraphConfig, solve
+from mapping.pose_graph import GraphConfig
+from mapping.pose_graph_solve import solve
 from mapping.survey import SurveyConfig
 from perception.records import InputError
 from tests.mapping.test_survey import error, fixes, flown  # noqa: F401

@@ -7,7 +7,8 @@ import pytest
 
 from mapping.keyframes import choose_keyframes
 from mapping.links import _missed, blended
-from mapping.pose_graph import Blend, Link, solve
+from mapping.pose_graph import Blend, Link
+from mapping.pose_graph_solve import solve
 from tests.mapping.worlds import Drift, World, fly
 
 

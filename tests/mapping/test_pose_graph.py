@@ -10,7 +10,8 @@ from scipy import stats
 
 from mapping.fixes import PositionFix
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
-from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, perpendicular, solve
+from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, perpendicular
+from mapping.pose_graph_solve import solve
 from perception.records import FloatArray
 from tests.mapping.worlds import Drift, Flight, crossed_legs, fly, make_world
 

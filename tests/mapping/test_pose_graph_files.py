@@ -12,9 +12,10 @@ import pytest
 
 from mapping.graph_files import read_g2o
 from mapping.keyframes import choose_keyframes, tie_fixes
-from mapping.pose_graph import Blend, GraphConfig, HeightStep, Solution, solve
+from mapping.pose_graph import Blend, GraphConfig, HeightStep, Solution
 from mapping.pose_graph_files import survey_poses, write_graph
 from mapping.pose_graph_sets import gtsam_factors, gtsam_values
+from mapping.pose_graph_solve import solve
 from mapping.survey import CorrectedSurvey, Diagnostics
 from perception.records import FloatArray, Trajectory
 from tests.mapping.gtsam_text import read_graph

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
-from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, solve
+from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution
 from mapping.pose_graph_incremental import IncrementalGraph
+from mapping.pose_graph_solve import solve
 from tests.mapping.test_pose_graph import end_fixes, flights, true_links
 
 CONFIG = GraphConfig(shared=0.8)

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from mapping.keyframes import choose_keyframes
-from mapping.pose_graph import GraphConfig, solve
+from mapping.pose_graph import GraphConfig
+from mapping.pose_graph_solve import solve
 from mapping.prior_tie import ties_to_prior
 from perception.records import Grid
 from tests.mapping.worlds import CRS, ORIGIN, Drift, World, crossed_legs, fly, make_world

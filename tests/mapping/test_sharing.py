@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes
-from mapping.pose_graph import GraphConfig, HeightStep, log_evidence, solve
+from mapping.pose_graph import GraphConfig, HeightStep
+from mapping.pose_graph_solve import log_evidence, solve
 from mapping.sharing import height_size, solve_shared
 from perception.records import FloatArray
 from tests.mapping.test_pose_graph import flights, rms

@@ -1,0 +1,275 @@
+"""The survey's graph solved: one linear system, each registration one factor, eliminated by GTSAM.
+
+All factors are linear in the corrections (`pose_graph`), so the answer is one elimination away. The patches of ground
+and the means of two keyframes that tie a registration to its passes are variables of no other factor: eliminated
+beforehand they leave one factor a registration, of two rows, and a third of the unknowns. What doubts the
+registrations weighs these factors anew and eliminates again, as often as it takes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import gtsam as typed_gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, E, G, H, M
+from scipy.stats import chi2
+
+from mapping.keyframes import KeyframeFix, Keyframes
+from mapping.pose_graph import (
+    TIE_M,
+    GraphConfig,
+    HeightStep,
+    Link,
+    Solution,
+    add_fix,
+    add_odometry,
+    add_passes,
+    add_step,
+    perpendicular,
+    same_dive,
+)
+from mapping.pose_graph_root import Root
+from perception.records import BoolArray, FloatArray
+
+gtsam: Any = typed_gtsam
+
+logger = logging.getLogger(__name__)
+
+# A solution whose gradient is not so much smaller than at the start has lost its digits: QR keeps twice as many.
+_LEAST_GAIN = 1e-7
+# By this factor GNC's cost nears the truncated one from step to step; and it ends when each weight is so near 0 or 1.
+_SHARPER, _DECIDED = 1.4, 1e-4
+_MOST_STEPS = 100
+
+
+class LinearGraph:
+    """A survey's graph as GTSAM's Gaussian factors; those that may be wrong stand apart and can be weighed.
+
+    Attributes
+    ----------
+    doubtful : factors of links, then height steps, then fixes.
+    """
+
+    def __init__(
+        self,
+        keyframes: Keyframes,
+        links: Sequence[Link],
+        fixes: Sequence[KeyframeFix],
+        config: GraphConfig,
+        steps: Sequence[HeightStep] = (),
+    ) -> None:
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        add_passes(graph, values, keyframes, config)
+        add_odometry(graph, values, keyframes, config, absolute=bool(fixes))
+        sure = graph.size()
+        for step in steps:
+            add_step(graph, step)
+        for fix in fixes:
+            add_fix(graph, fix)
+        linear = graph.linearize(values)
+        self._sure = [linear.at(i) for i in range(sure)]
+        self.doubtful = [_link_factor(keyframes, link) for link in links]
+        self.doubtful += [linear.at(i) for i in range(sure, linear.size())]
+        # The weight that each carries now: GTSAM holds it as a noise model.
+        self._weight = np.ones(len(self.doubtful))
+        self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(
+            self.graph(np.ones(len(self.doubtful)))
+        )
+
+    def graph(self, weight: FloatArray) -> Any:
+        """Return the factors that count, the doubtful ones with the weights (0 to 1) of their squares."""
+        graph = gtsam.GaussianFactorGraph()
+        for factor in self._sure:
+            graph.add(factor)
+        for factor, w in zip(self.doubtful, weight, strict=True):
+            if w > 0:
+                factor.setModel(False, np.full(factor.rows(), w**-0.5))
+                graph.add(factor)
+        self._weight = np.where(weight > 0, weight, self._weight)
+        return graph
+
+    def optimum(self, weight: FloatArray) -> Any:
+        """Return the answer under these weights."""
+        return self.graph(weight).eliminateMultifrontal(self._ordering).optimize()
+
+    def misfit(self, values: Any) -> FloatArray:
+        """Return chi-square of each doubtful factor, unweighted."""
+        return np.array([2.0 * f.error(values) for f in self.doubtful]) / self._weight
+
+    def net(self, graph: Any) -> tuple[Any, Any]:
+        """Return the Bayes net of a graph of these factors and its answer, by QR where Cholesky loses it.
+
+        Raises
+        ------
+        RuntimeError
+            The graph does not determine its unknowns.
+        """
+        try:
+            net = graph.eliminateSequential(self._ordering)
+            values = net.optimize()
+            left, start = graph.gradient(values).norm(), graph.gradientAtZero().norm()
+            if left <= _LEAST_GAIN * start + 1e-9:
+                return net, values
+            logger.info("pose graph: gradient %.1e of %.1e left, solved by QR", left, start)
+        except RuntimeError as error:
+            logger.info("pose graph: solved by QR: %s", str(error).strip().splitlines()[0])
+        net = graph.eliminateSequential(self._ordering, gtsam.EliminateQR)
+        return net, net.optimize()
+
+
+def _link_factor(keyframes: Keyframes, link: Link) -> Any:
+    """Return a registration as one factor between keyframes and pass errors, its own variables eliminated."""
+    graph, inner = gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    eye, nothing = np.eye(2), np.zeros(2)
+    tie = gtsam.noiseModel.Isotropic.Sigma(2, TIE_M)
+    ends = (
+        (link.first, link.first_blend, link.first_offset_m),
+        (link.second, link.second_blend, link.second_offset_m),
+    )
+    for side, (k, blend, offset) in enumerate(ends):
+        mean = E(k)
+        if blend is not None and blend.low != blend.high:
+            mean = M(side)
+            graph.add(
+                gtsam.JacobianFactor(
+                    E(blend.low), (blend.share - 1.0) * eye, E(blend.high), -blend.share * eye,
+                    mean, eye, nothing, tie,
+                )
+            )  # fmt: skip
+            inner.push_back(mean)
+        swing = np.column_stack([np.zeros((2, 2)), perpendicular(offset)])
+        graph.add(
+            gtsam.JacobianFactor(
+                mean, -eye, B(int(keyframes.strip[k])), -swing, G(side), eye, nothing, tie
+            )
+        )
+        inner.push_back(G(side))
+    white = np.linalg.inv(np.linalg.cholesky(link.covariance_m2))
+    unit = gtsam.noiseModel.Unit.Create(2)
+    graph.add(gtsam.JacobianFactor(G(0), -white, G(1), white, white @ link.shift_m, unit))
+    _, remaining = gtsam.JacobianFactor(graph).eliminate(inner)
+    return remaining
+
+
+def consistent(graph: LinearGraph, config: GraphConfig) -> BoolArray:
+    """Return which doubtful factors agree with the rest: truncated least squares by graduated non-convexity.
+
+    Yang et al. 2020, equations 12 to 14, from the solution of all factors; `gtsam.GncGaussNewtonOptimizer` decides the
+    same (tested), but solves and linearises the unreduced graph at each step.
+    """
+    weight = np.ones(len(graph.doubtful))
+    rows = np.array([f.rows() for f in graph.doubtful])
+    bound = np.asarray(chi2.ppf(1.0 - config.outlier_probability, rows))
+    misfit = graph.misfit(graph.optimum(weight))
+    far = 2.0 * misfit > bound
+    if not far.any():
+        return weight > 0.5
+    mu = float((bound[far] / (2.0 * misfit[far] - bound[far])).min())
+    for _ in range(_MOST_STEPS):
+        low, high = mu / (mu + 1.0) * bound, (mu + 1.0) / mu * bound
+        between = np.sqrt(bound * mu * (mu + 1.0) / np.maximum(misfit, 1e-300)) - mu
+        weight = np.where(misfit >= high, 0.0, np.where(misfit <= low, 1.0, between))
+        misfit = graph.misfit(graph.optimum(weight))
+        if np.minimum(weight, 1.0 - weight).max() < _DECIDED:
+            break
+        mu *= _SHARPER
+    return weight > 0.5
+
+
+def solve(
+    keyframes: Keyframes,
+    links: Sequence[Link] = (),
+    fixes: Sequence[KeyframeFix] = (),
+    config: GraphConfig | None = None,
+    robust: bool = True,
+    steps: Sequence[HeightStep] = (),
+) -> Solution:
+    """Solve the survey's graph; wrong registrations and fixes are found by graduated non-convexity.
+
+    Parameters
+    ----------
+    robust : False takes every registration and fix at its word.
+    """
+    config = config or GraphConfig()
+    linear = LinearGraph(keyframes, links, fixes, config, steps)
+    used = np.ones(len(linear.doubtful), bool)
+    if robust and len(used):
+        used = consistent(linear, config)
+    graph = linear.graph(used.astype(float))
+    try:
+        net, values = linear.net(graph)
+    except RuntimeError as error:
+        logger.warning("the pose graph is indeterminate: %s", str(error).strip().splitlines()[0])
+        net, values = None, None
+    n_links = len(links)
+    solution = _solution(
+        keyframes, config, graph, net, values, used[:n_links],
+        used[n_links + len(steps) :], used[n_links : n_links + len(steps)],
+    )  # fmt: skip
+    logger.info(
+        "pose graph: %d keyframes, %d of %d registrations used, error %.1f -> %.1f",
+        len(keyframes), solution.link_used.sum(), n_links, solution.error_before, solution.error_after,
+    )  # fmt: skip
+    return solution
+
+
+def log_evidence(
+    keyframes: Keyframes,
+    links: Sequence[Link],
+    fixes: Sequence[KeyframeFix],
+    config: GraphConfig,
+    steps: Sequence[HeightStep] = (),
+) -> float:
+    """Return the log-probability of the data under `config`, all unknowns integrated out, but for a constant.
+
+    Of the noise models' own determinants only the one that `GraphConfig.shared` changes is counted. NaN
+    where the graph does not determine its unknowns.
+    """
+    linear = LinearGraph(keyframes, links, fixes, config, steps)
+    graph = linear.graph(np.ones(len(linear.doubtful)))
+    try:
+        net, values = linear.net(graph)
+    except RuntimeError:
+        return float("nan")
+    chained = int(same_dive(keyframes).sum()) if config.shared else 0
+    half_of_priors = -1.5 * chained * np.log(1.0 - config.shared**2)
+    return float(half_of_priors - graph.error(values) - Root.of(net).half_log_det)
+
+
+def _solution(
+    keyframes: Keyframes, config: GraphConfig, graph: Any, net: Any, values: Any,
+    link_used: BoolArray, fix_used: BoolArray, step_used: BoolArray,
+) -> Solution:  # fmt: skip
+    """Put an answer and its covariances into the survey's terms; without an answer, no correction and NaN."""
+    passes = range(len(keyframes.starts) - 1)
+    keys = [[E(k) for k in range(len(keyframes))], [B(p) for p in passes], [H(p) for p in passes]]
+    root = None
+    if values is None:
+        found = [np.zeros((len(k), d)) for k, d in zip(keys, (2, 3, 1), strict=True)]
+        covariance = [np.full((len(k), d, d), np.nan) for k, d in zip(keys, (2, 3, 1), strict=True)]
+        before = after = float("nan")
+    else:
+        root = Root.of(net)
+        found = [np.array([values.at(key) for key in group]) for group in keys]
+        covariance = [root.covariances(group) for group in keys]
+        before, after = graph.error(gtsam.VectorValues.Zero(values)), graph.error(values)
+    return Solution(
+        correction_m=found[0],
+        covariance_m2=covariance[0],
+        pass_errors=found[1],
+        pass_sigma=np.sqrt(np.diagonal(covariance[1], axis1=1, axis2=2)),
+        height_m=found[2][:, 0],
+        height_sigma_m=np.sqrt(covariance[2][:, 0, 0]),
+        link_used=link_used,
+        fix_used=fix_used,
+        step_used=step_used,
+        error_before=before,
+        error_after=after,
+        indeterminate=values is None,
+        worsened=bool(after > before * (1 + 1e-9) + 1e-9),
+        config=config,
+        root=root,
+    )
