@@ -31,6 +31,8 @@ from perception.stencils import (
 
 logger = logging.getLogger(__name__)
 
+# Nodes of a map whose error is judged as a whole; a larger one is so many patches.
+_PATCH = 50_000
 # Heights, log-albedo and gains.
 Fields = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -196,7 +198,9 @@ class Problem:
         """Solve by conjugate gradients, preconditioned by a multigrid cycle.
 
         Stops where the error is `tolerance` posterior sigmas in all: no combination of heights is then further from the
-        solution than that, however the data scale. The cycle measures the error squared short by its least
+        solution than that, however the data scale. On a map of more than `_PATCH` nodes that is asked of its patches,
+        whose errors add up in square: of the whole it would cost three times the steps and change heights by a
+        hundredth of their sigma. The cycle measures the error squared short by its least
         eigenvalue, a hundredth where one pass is all there is; the steps so far tell it (Lanczos).
 
         What is tied in single precision may round to a cycle that is not positive, with which no step can be trusted:
@@ -204,6 +208,7 @@ class Problem:
         do not get there.
         """
         x: Fields = (start[0].copy(), start[1].copy(), start[2].copy())
+        tolerance *= np.sqrt(max(self.shape[0] * self.shape[1] / _PATCH, 1.0))
         # The cycle's least eigenvalue is hardly below this in the best of cases.
         steps, positive = self._descend(self.hierarchy, x, right, tolerance, most, 0.2)
         if not positive:

@@ -14,13 +14,15 @@ import numpy as np
 from scipy import sparse
 
 from perception.rays import Rays
-from perception.records import BoolArray, FloatArray
+from perception.records import BoolArray, FloatArray, IntArray
 from perception.shading import Rows
 from perception.soundings import Equations, bilinear_rows
 
 # Looks whose mean direction has at least this length come from one side (1 = all from one direction).
 _ONE_SIDED = 0.8
 _STRETCH_CELLS = 4
+# The mean of so few points is no profile.
+_FEW = 3
 
 
 def one_sided(rows: Rows, shape: tuple[int, int]) -> BoolArray:
@@ -53,8 +55,11 @@ def mean_profiles(
     sigma_m : 1-sigma of a mean.
     relative : hold the rise of the mean from below the track, not the mean itself.
     """
-    parts: list[sparse.csr_matrix] = []
     stretch = _STRETCH_CELLS * cell_m
+    value: list[FloatArray] = []
+    line: list[IntArray] = []
+    node: list[IntArray] = []
+    lines = 0
     for ray in rays:
         ground = np.arange(1, int(ray.reach_m / stretch)) * stretch
         every = slice(None, None, 2)
@@ -66,25 +71,36 @@ def mean_profiles(
         r = np.where(inside, row, 0).astype(np.int64)
         inside &= single[r, c]
         number = inside.sum(axis=0)
+        inside &= number > _FEW
+        held = np.flatnonzero(number > _FEW)
         group = np.broadcast_to(np.arange(len(ground)), inside.shape)[inside]
-        if not len(group):
-            continue
-        points = bilinear_rows(row[inside], col[inside], 1.0 / number[group], base.shape)
-        gather = sparse.csr_matrix(
-            (np.ones(len(group)), (group, np.arange(len(group)))), shape=(len(ground), len(group))
-        )
-        means = sparse.csr_matrix((gather @ points)[np.flatnonzero(number > 3)])
-        if relative and means.shape[0]:
-            below = bilinear_rows(
-                np.clip((ray.northing_m - south_m) / cell_m, 0, base.shape[0] - 1.001),
-                np.clip((ray.easting_m - west_m) / cell_m, 0, base.shape[1] - 1.001),
-                np.full(len(ray.easting_m), 1.0 / len(ray.easting_m)),
-                base.shape,
-            )
-            track = sparse.csr_matrix(np.ones((means.shape[0], below.shape[0])) @ below)
-            means = sparse.csr_matrix(means - track)
-        parts.append(means)
-    if not parts:
-        return Equations(sparse.csr_matrix((0, base.size)), np.zeros(0), np.zeros(0))
-    matrix = sparse.csr_matrix(sparse.vstack(parts))
-    return Equations(matrix, np.full(matrix.shape[0], sigma_m**-2.0), matrix @ base.ravel())
+        points = bilinear_rows(row[inside], col[inside], 1.0 / number[group], base.shape).tocoo()
+        value.append(points.data)
+        line.append(lines + np.searchsorted(held, group[points.row]))
+        node.append(points.col)
+        if relative:
+            below, share = _mean_below(ray, west_m, south_m, cell_m, base.shape)
+            value.append(np.tile(-share, len(held)))
+            line.append(lines + np.repeat(np.arange(len(held)), len(below)))
+            node.append(np.tile(below, len(held)))
+        lines += len(held)
+    matrix = sparse.csr_matrix(
+        (np.concatenate(value), (np.concatenate(line), np.concatenate(node))),
+        shape=(lines, base.size),
+    )
+    return Equations(matrix, np.full(lines, sigma_m**-2.0), matrix @ base.ravel())
+
+
+def _mean_below(
+    ray: Rays, west_m: float, south_m: float, cell_m: float, shape: tuple[int, ...]
+) -> tuple[IntArray, FloatArray]:
+    """Return the nodes below a track and their shares in the mean height there."""
+    points = bilinear_rows(
+        np.clip((ray.northing_m - south_m) / cell_m, 0, shape[0] - 1.001),
+        np.clip((ray.easting_m - west_m) / cell_m, 0, shape[1] - 1.001),
+        np.full(len(ray.easting_m), 1.0 / len(ray.easting_m)),
+        (shape[0], shape[1]),
+    )
+    nodes, place = np.unique(points.indices, return_inverse=True)
+    share: FloatArray = np.bincount(place, points.data).astype(float)
+    return nodes, share
