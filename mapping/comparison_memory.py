@@ -20,13 +20,13 @@ from mapping.pose_graph import Link, Solution, perpendicular
 from mapping.registration import Match
 from perception.records import ElevationStrip, FloatArray, Grid
 
-# Parts of a match's 1-sigma by which its ground may have moved, and log-likelihood by which what is expected of its
-# shift may have changed, before it is compared again.
-_MOVED, _EXPECTED = 1.0, 1.0
-# A search wider or narrower by this factor is another search.
-_SEARCH = 1.4
-# Of a square that did not match nothing tells how sharp it is: it has moved when by so much of its cell.
-_CELLS = 1.0
+# Parts of a match's 1-sigma by which its ground may have moved before it is compared again: while a survey grows, and
+# where its answer is asked for. Links are chosen by their covariances and believed by thresholds, so that a tenth of
+# a metre may tip a few of them, and those move the whole by up to 0.3 of its sigma.
+QUICK, SETTLED = 3.0, 0.1
+# What is expected of a shift may have changed by as much (in log-likelihood at most by this), and its search's width
+# by this factor.
+_EXPECTED, _SEARCH = 1.0, 1.4
 # The floor is looked at in so many places along each side of a square.
 _LOOKS = 3
 
@@ -71,10 +71,13 @@ class ComparisonMemory:
 
     Attributes
     ----------
+    tolerance : in sigmas of a match, how far its ground may have moved before it is compared again. A square that did
+        not match tells no sigma: a cell of the comparison stands for it.
     compared : squares compared since it was begun; what it recalled is not counted.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, tolerance: float = SETTLED) -> None:
+        self.tolerance = tolerance
         self.compared = 0
         self._seen: dict[tuple[float, ...], _Seen] = {}
         self._now: list[_Seen] = []
@@ -85,7 +88,7 @@ class ComparisonMemory:
         found = {}
         for number, (window, now) in enumerate(zip(given.windows, self._now, strict=True)):
             then = self._seen.get(_key(window, given.cell_m))
-            if then is not None and _unchanged(then, now, given.cell_m):
+            if then is not None and _unchanged(then, now, given.cell_m, self.tolerance):
                 found[number] = _carried(then, now)
         return found
 
@@ -160,28 +163,29 @@ def _heights(floor: Grid | None, window: Window) -> FloatArray | None:
     return height
 
 
-def _unchanged(then: _Seen, now: _Seen, cell_m: float) -> bool:
+def _unchanged(then: _Seen, now: _Seen, cell_m: float, tolerance: float) -> bool:
     """Return whether a comparison made `then` would come out the same `now`, as far as it can tell."""
     wide_then, wide_now = (float(np.linalg.eigvalsh(s.expected_m2)[-1]) ** 0.5 for s in (then, now))
-    if not 1.0 / _SEARCH < wide_now / wide_then < _SEARCH:
+    search = min(_SEARCH, 1.0 + tolerance)
+    if not 1.0 / search <= wide_now / wide_then <= search:
         return False
     match = then.match
     known = match.accepted and bool(np.isfinite(match.covariance_m2).all())
-    if known:
-        least_m = _MOVED * float(np.trace(match.covariance_m2)) ** 0.5
-    else:
-        least_m = _CELLS * cell_m
+    sigma_m = float(np.trace(match.covariance_m2)) ** 0.5 if known else cell_m
+    least_m = tolerance * sigma_m
     move = now.ground_m - then.ground_m
     # The square holds the first pass's ground; the second is looked for about it.
-    if np.hypot(*move[0].T).max() > max(least_m, _CELLS * cell_m):
+    if np.hypot(*move[0].T).max() > tolerance * max(sigma_m, cell_m):
         return False
     apart = move[1] - move[0]
-    if np.hypot(*(apart[1] - apart[0])) > least_m:
+    bend_m, shift_m = np.hypot(*(apart[1] - apart[0])), np.hypot(*apart.mean(axis=0))
+    if bend_m > least_m or not _same_floor(then, now, least_m):
         return False
     if not known:
-        return bool(np.hypot(*apart.mean(axis=0)) < least_m) and _same_floor(then, now, least_m)
+        return bool(shift_m < least_m)
+    # Where a match was found it would be found again; what was expected had a say in choosing it.
     before, after = (_cost(m.shift_m, s) for m, s in ((match, then), (_carried(then, now), now)))
-    return abs(after - before) < _EXPECTED and _same_floor(then, now, least_m)
+    return abs(after - before) < min(_EXPECTED, tolerance)
 
 
 def _same_floor(then: _Seen, now: _Seen, least_m: float) -> bool:

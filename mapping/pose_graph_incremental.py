@@ -1,8 +1,8 @@
-"""The pose graph pass by pass in iSAM2: each new pass adds its factors, and only what they touch is solved anew."""
+"""The pose graph pass by pass in iSAM2: passes and registrations come and go, and only what they touch is solved anew."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any
 
 import gtsam as typed_gtsam
@@ -21,13 +21,12 @@ from mapping.pose_graph import (
     add_step,
     solution_of,
 )
-from perception.records import BoolArray
 
 gtsam: Any = typed_gtsam
 
 
 class IncrementalGraph:
-    """A survey's graph that grows; its answer is that of `pose_graph.solve` on the same factors.
+    """A survey's graph that grows; its answer is that of `pose_graph_solve.solve` on the same factors.
 
     Parameters
     ----------
@@ -37,67 +36,72 @@ class IncrementalGraph:
 
     def __init__(self, config: GraphConfig, absolute: bool) -> None:
         parameters = gtsam.ISAM2Params()
-        # The same as in the batch: Cholesky squares the condition number.
+        # Cholesky squares the condition number.
         parameters.setFactorization("QR")
         parameters.relinearizeSkip = 1
         self._isam = gtsam.ISAM2(parameters)
         self._config, self._absolute = config, absolute
         self._keyframes: Keyframes | None = None
-        self._links: list[Link] = []
-        # Factor of each link, fix and step, in the order they were added; None taken out again.
-        self._link_factor: list[int | None] = []
-        self._fix_factor: list[int | None] = []
-        self._step_factor: list[int | None] = []
-        self._first_error = 0.0
+        # Indices of the factors of each registration, fix and step that is in.
+        self._held: dict[Hashable, list[int]] = {}
+        self._numbers = 0
+        self._sizes = (0, 0, 0)
 
-    @property
-    def links(self) -> tuple[Link, ...]:
-        """Every registration ever added, in order; `Solution.link_used` says which are still in."""
-        return tuple(self._links)
+    def goes_on(self, keyframes: Keyframes, config: GraphConfig, absolute: bool) -> bool:
+        """Return whether the graph can grow to these keyframes; where other things are assumed it begins anew."""
+        known = self._keyframes
+        same = known is None or (
+            np.array_equal(known.starts, keyframes.starts[: len(known.starts)])
+            and np.array_equal(known.line, keyframes.line[: len(known)])
+        )
+        return same and config == self._config and absolute == self._absolute
 
-    def add_pass(self, keyframes: Keyframes, fixes: Sequence[KeyframeFix] = ()) -> None:
-        """Add the last pass of `keyframes`, those of all passes so far, and fixes of it."""
+    def add_passes(self, keyframes: Keyframes) -> None:
+        """Add the passes of `keyframes`, those of all passes so far, that are not there yet."""
+        known = self._keyframes
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        number = len(keyframes.starts) - 2
-        add_passes(graph, values, keyframes, self._config, number)
-        first = int(keyframes.starts[number])
+        add_passes(
+            graph, values, keyframes, self._config, 0 if known is None else len(known.starts) - 1
+        )
+        first = 0 if known is None else len(known)
         add_odometry(graph, values, keyframes, self._config, self._absolute, first)
-        before = graph.size()
-        for fix in fixes:
-            add_fix(graph, fix)
-        new = self._isam.update(graph, values).getNewFactorsIndices()
-        self._fix_factor += [int(i) for i in list(new)[before:]]
+        if graph.size():
+            self._isam.update(graph, values)
         self._keyframes = keyframes
 
-    def add_links(self, links: Sequence[Link], steps: Sequence[HeightStep] = ()) -> None:
-        """Add registrations and height steps between passes that are there."""
+    def hold(
+        self,
+        links: Sequence[Link] = (),
+        fixes: Sequence[KeyframeFix] = (),
+        steps: Sequence[HeightStep] = (),
+    ) -> None:
+        """Make the graph hold these registrations, fixes and height steps, and no others; what stays is left alone."""
         if self._keyframes is None:
             raise ValueError("add a pass before its registrations")
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        places = []
-        for link in links:
-            number = len(self._links)
-            self._links.append(link)
-            places.append(add_link(graph, values, self._keyframes, link, number))
-        after = graph.size()
-        for step in steps:
-            add_step(graph, step)
-        new = list(self._isam.update(graph, values).getNewFactorsIndices())
-        self._link_factor += [int(new[place]) for place in places]
-        self._step_factor += [int(i) for i in new[after:]]
-
-    def take_out(self, link: Sequence[int] = (), fix: Sequence[int] = ()) -> None:
-        """Take links and fixes out again, by their number in the order they were added."""
-        gone = []
-        for chosen, factors in ((link, self._link_factor), (fix, self._fix_factor)):
-            for number in chosen:
-                factor = factors[number]
-                if factor is not None:
-                    gone.append(factor)
-                factors[number] = None
-        if gone:
-            removed = gtsam.KeyVector(gone) if hasattr(gtsam, "KeyVector") else gone
-            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), removed)
+        factors: list[Link | KeyframeFix | HeightStep] = [*links, *fixes, *steps]
+        wanted = [_name(factor) for factor in factors]
+        places: dict[Hashable, range] = {}
+        for name, factor in zip(wanted, factors, strict=True):
+            if name in self._held or name in places:
+                continue
+            before = int(graph.size())
+            if isinstance(factor, Link):
+                add_link(graph, values, self._keyframes, factor, self._numbers)
+                self._numbers += 1
+            elif isinstance(factor, HeightStep):
+                add_step(graph, factor)
+            else:
+                add_fix(graph, factor)
+            places[name] = range(before, int(graph.size()))
+        kept = set(wanted)
+        gone = [name for name in self._held if name not in kept]
+        removed = [index for name in gone for index in self._held.pop(name)]
+        if removed or graph.size():
+            # A registration goes with the patches of ground that it brought, which nothing else holds.
+            new = list(self._isam.update(graph, values, removed).getNewFactorsIndices())
+            self._held |= {name: [int(new[i]) for i in where] for name, where in places.items()}
+        self._sizes = len(links), len(fixes), len(steps)
 
     def solution(self) -> Solution:
         """Return the present answer, with marginal covariances."""
@@ -109,18 +113,25 @@ class IncrementalGraph:
         error = sum(
             factors.at(i).error(estimate) for i in range(factors.size()) if factors.exists(i)
         )
-
-        def used(factor: Sequence[int | None]) -> BoolArray:
-            return np.array([f is not None for f in factor], bool)
-
+        links, fixes, steps = (np.ones(size, bool) for size in self._sizes)
         return solution_of(
             self._keyframes,
             estimate.atVector,
             isam.marginalCovariance,
             self._config,
-            link_used=used(self._link_factor),
-            fix_used=used(self._fix_factor),
-            step_used=used(self._step_factor),
+            link_used=links,
+            fix_used=fixes,
+            step_used=steps,
             error_before=float(error),
             error_after=float(error),
         )
+
+
+def _name(factor: Link | KeyframeFix | HeightStep) -> Hashable:
+    """Return what tells a factor from every other."""
+    if isinstance(factor, HeightStep):
+        return factor
+    if isinstance(factor, KeyframeFix):
+        return factor.keyframe, factor.correction_m.tobytes(), factor.covariance_m2.tobytes()
+    ends = np.concatenate([factor.first_offset_m, factor.second_offset_m, factor.shift_m])
+    return factor.first, factor.second, ends.tobytes(), factor.covariance_m2.tobytes()

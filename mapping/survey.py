@@ -74,6 +74,8 @@ class Round:
     evidence : mean log-likelihood ratio of a comparison against no match, refused ones included.
     moved_m : rms by which the track still moved.
     error_before, error_after : the graph's error (half a chi-square).
+    passes : how many there were.
+    anew : comparisons made in this round; the others held still since an earlier correction (`ComparisonMemory`).
     """
 
     floor: str
@@ -86,6 +88,8 @@ class Round:
     moved_m: float
     error_before: float
     error_after: float
+    passes: int
+    anew: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +269,7 @@ def _round(
     every = find_overlaps(corrected, side_m)
     reached, expected = _within_reach(given, state, every)
     windows = _worth_comparing(reached, state, len(keyframes), last, known)
+    compared = given.memory.compared if given.memory else 0
     results, links = register(
         corrected, given.textures, keyframes, state.solution, windows,
         square_cell_m(side_m, given.cell_m), config.match, config.graph, config.widest_search_m,
@@ -287,6 +292,8 @@ def _round(
         moved_m=float(np.sqrt((moved**2).sum(axis=1).mean())),
         error_before=after.error_before,
         error_after=after.error_after,
+        passes=len(given.thin),
+        anew=given.memory.compared - compared if given.memory else len(found),
     )
     logger.info("round %d: %s", len(state.rounds) + 1, said)
     believed_here = zip((r.window for r in found if r.match.accepted), links, strict=True)

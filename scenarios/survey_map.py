@@ -175,7 +175,7 @@ def _corrected(
 ) -> CorrectedSurvey:
     """Correct the track by registration, on the map's own drafts, and by a prior map where one is given.
 
-    Pass by pass no draft is made: it would match every pass anew.
+    Pass by pass too the drafts come when all passes are there, as the map does.
     """
 
     def looks(corrected: CorrectedSurvey) -> list[Look]:
@@ -186,7 +186,7 @@ def _corrected(
         corrected = pass_by_pass(navigated, fixes, progress=progress)
     else:
         corrected = correct_survey(navigated, fixes, progress=progress)
-    if method == "joint" and not incremental:
+    if method == "joint":
         corrected = refine_on_map(navigated, corrected, looks, fixes, survey.crs, progress)
     if prior is None:
         return corrected

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
@@ -26,13 +28,14 @@ def survey(seed: int) -> tuple[Keyframes, list[Keyframes], list[Link], list[Keyf
 def grown(seed: int, steps: list[HeightStep]) -> tuple[IncrementalGraph, list[Link], Keyframes]:
     keyframes, so_far, links, ties = survey(seed)
     graph = IncrementalGraph(CONFIG, absolute=True)
-    order: list[Link] = []
     for number, keys in enumerate(so_far):
-        graph.add_pass(keys, [t for t in ties if keyframes.strip[t.keyframe] == number])
-        new = [x for x in links if keyframes.strip[x.second] == number]
-        order += new
-        graph.add_links(new, [s for s in steps if s.second == number])
-    return graph, order, keyframes
+        graph.add_passes(keys)
+        graph.hold(
+            [x for x in links if keyframes.strip[x.second] <= number],
+            [t for t in ties if keyframes.strip[t.keyframe] <= number],
+            [s for s in steps if s.second <= number],
+        )
+    return graph, links, keyframes
 
 
 def same(a: Solution, b: Solution) -> None:
@@ -54,10 +57,24 @@ def test_pass_by_pass_gives_what_all_at_once_gives() -> None:
 
 
 def test_a_registration_taken_out_again_leaves_no_trace() -> None:
-    graph, order, keyframes = grown(4, [])
+    steps = [HeightStep(0, 3, 0.2, 0.05), HeightStep(1, 4, -0.1, 0.05)]
+    graph, links, keyframes = grown(4, steps)
     ties = survey(4)[3]
-    gone = [2, 7, len(order) - 1]
-    graph.take_out(gone)
-    kept = [x for n, x in enumerate(order) if n not in gone]
-    same(graph.solution(), solve(keyframes, kept, ties, CONFIG, robust=False))
+    gone = {2, 7, len(links) - 1}
+    kept = [x for n, x in enumerate(links) if n not in gone]
+    graph.hold(kept, ties[:1], steps[1:])
+    same(graph.solution(), solve(keyframes, kept, ties[:1], CONFIG, robust=False, steps=steps[1:]))
     assert graph.solution().link_used.sum() == len(kept)
+    graph.hold(links, ties, steps)
+    same(graph.solution(), solve(keyframes, links, ties, CONFIG, robust=False, steps=steps))
+
+
+def test_a_graph_goes_on_only_under_the_assumptions_that_it_began_with() -> None:
+    keyframes, so_far, _, _ = survey(5)
+    graph = IncrementalGraph(CONFIG, absolute=True)
+    graph.add_passes(so_far[1])
+    assert graph.goes_on(keyframes, CONFIG, absolute=True)
+    assert not graph.goes_on(keyframes, CONFIG, absolute=False)
+    assert not graph.goes_on(keyframes, replace(CONFIG, shared=0.0), absolute=True)
+    moved = replace(keyframes, line=keyframes.line + 1)
+    assert not graph.goes_on(moved, CONFIG, absolute=True)
