@@ -223,7 +223,11 @@ def coincide(
 
 
 def refine(
-    fields: dict[str, Fields], gains: dict[str, float], best: FloatArray, inner: int
+    fields: dict[str, Fields],
+    gains: dict[str, float],
+    best: FloatArray,
+    inner: int,
+    waves: dict[str, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray | None, FloatArray]:
     """Climb to the top of the summed correlation below a cell; return offset, covariance, lobe (cells).
 
@@ -232,14 +236,23 @@ def refine(
     squares share has no imaginary part at the right d; what they do not has random phase. So the sum of
     k k' (Im X)^2 is the slope's variance, and curvature^-1 variance curvature^-1 the shift's (the
     sandwich), whatever the fields' spectra.
+
+    Parameters
+    ----------
+    waves : (inner, inner // 2 + 1) by which each wave of a channel counts, where not all count alike.
     """
+    waves = waves or {}
     # Channels that share their speckle (shading and echo) add up before they are squared below.
     total = np.zeros((inner, inner // 2 + 1), complex)
     filled = 0.0
+    known: dict[int, tuple[npt.NDArray[np.complexfloating[Any]], float]] = {}
     for channel, gain in gains.items():
         if gain > 0:
-            spectrum, part = _cross_spectrum(fields[channel], best, inner)
-            total += spectrum * (gain / inner**2)
+            field = fields[channel]
+            if id(field) not in known:
+                known[id(field)] = _cross_spectrum(field, best, inner)
+            spectrum, part = known[id(field)]
+            total += spectrum * (waves.get(channel, 1.0) * (gain / inner**2))
             filled = max(filled, part)
     if not filled:
         return np.zeros(2), None, np.ones(2)
@@ -278,9 +291,11 @@ def _cross_spectrum(
     here = np.s_[..., edge : edge + inner, edge : edge + inner]
     col, row = best.astype(int)
     there = np.s_[..., edge + row : edge + row + inner, edge + col : edge + col + inner]
-    both = (wu[here] > 0) & (wv[there] > 0)
-    left = np.where(both, wu[here] * u[here], 0.0)
-    right = np.where(both, wv[there] * v[there], 0.0)
+    # Weighed alike: where one pass's weight rises and the other's falls, as between two tracks, weights of their own
+    # would draw the match along (by 0.1 m, the same way at each pair of neighbours).
+    weight = np.sqrt(wu[here] * wv[there])
+    both = weight > 0
+    left, right = weight * u[here], weight * v[there]
     spectrum = np.conj(fft.rfft2(left)) * fft.rfft2(right)
     return spectrum.sum(axis=0) if spectrum.ndim == 3 else spectrum, float(both.mean())
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -43,6 +44,8 @@ from perception.records import FloatArray
 _SIDES = ((PORT, "port"), (STARBOARD, "starboard"))
 # Where three less of evidence would do, two less of margin do: two fits of one square share most of their noise.
 _MARGIN_COUNTS = 1.5
+# Looks are told apart by half a degree, and the part of all waves that must be there of a kind.
+_HEADING_STEP, _LEAST_WAVES = np.radians(0.5), 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,13 +102,13 @@ def match(
     outside = np.ones((size, size), bool)
     outside[edge : edge + inner, edge : edge + inner] = False
     wa[:, outside] = 0.0
-    fields, surfaces = _compare(a, wa, b, wb, (heading_a, heading_b), reach, cell_m)
+    fields, surfaces, waves = _compare(a, wa, b, wb, (heading_a, heading_b), reach, inner, cell_m)
     if "relief" in surfaces:
         share = np.sqrt(first.relief_share * second.relief_share)
         surfaces["relief"] = surfaces["relief"].scaled(float(share))
     if not surfaces:
         return _refused("no common ground")
-    found = judge(fields, surfaces, inner, cell_m, config, prior_m2)
+    found = judge(fields, surfaces, inner, cell_m, config, prior_m2, waves)
     if found.reason and not np.isfinite(found.covariance_m2).all():
         return _refused(found.reason)
     centre = tuple(np.round(found.shift_cells[::-1]).astype(int) + reach)
@@ -128,11 +131,12 @@ def _refused(reason: str) -> Match:
 
 def _compare(
     a: FloatArray, wa: FloatArray, b: FloatArray, wb: FloatArray, headings: tuple[float, float],
-    reach: int, cell_m: float,
-) -> tuple[dict[str, Fields], dict[str, Surface]]:  # fmt: skip
-    """Return the fields of every channel that the two squares have, and their correlations."""
+    reach: int, inner: int, cell_m: float,
+) -> tuple[dict[str, Fields], dict[str, Surface], dict[str, FloatArray]]:  # fmt: skip
+    """Return fields, correlations and weights of waves of every channel that the two squares have."""
     fields: dict[str, Fields] = {}
     surfaces: dict[str, Surface] = {}
+    waves: dict[str, FloatArray] = {}
     relief = correlate(a[RELIEF], wa[RELIEF], b[RELIEF], wb[RELIEF], reach)
     if relief is not None:
         fields["relief"] = (a[RELIEF], wa[RELIEF], b[RELIEF], wb[RELIEF])
@@ -144,42 +148,45 @@ def _compare(
         if i not in first or j not in second:
             continue
         pair = (a[i], wa[i], b[j], wb[j])
-        gains = _gains(a.shape[1], _towards(i, headings[0]), _towards(j, headings[1]))
-        for kind, field, surface in _of_sides(pair, first[i], second[j], gains, reach):
-            fields[f"{kind} {name_a}-{name_b}"] = field
-            surfaces[f"{kind} {name_a}-{name_b}"] = surface
+        looks = _towards(i, headings[0]), _towards(j, headings[1])
+        gains = _gains(a.shape[1], *looks)
+        for kind, sign, surface in _of_sides(pair, first[i], second[j], gains, reach):
+            name = f"{kind} {name_a}-{name_b}"
+            fields[name], surfaces[name] = pair, surface
+            waves[name] = sign * _gains(inner, *looks)[kind]
     landmarks = landmark_field(a[OBJECTS], wa[OBJECTS], b[OBJECTS], wb[OBJECTS], cell_m)
     if landmarks is not None:
         fields["objects"] = landmarks
         surfaces["objects"] = coincide(*landmarks, reach)
-    return fields, surfaces
+    return fields, surfaces, waves
 
 
 def _towards(side: int, heading_rad: float) -> tuple[float, float]:
-    """Return the direction (east, north) in which a side of the sonar looks."""
+    """Return the direction (east, north) in which a side of the sonar looks, to half a degree."""
     sign = 1.0 if side == STARBOARD else -1.0
-    return sign * float(np.cos(heading_rad)), -sign * float(np.sin(heading_rad))
+    heading = round(heading_rad / _HEADING_STEP) * _HEADING_STEP
+    return sign * float(np.cos(heading)), -sign * float(np.sin(heading))
 
 
+@lru_cache(maxsize=256)
 def _gains(size: int, u: tuple[float, float], v: tuple[float, float]) -> dict[str, FloatArray]:
-    """Return which waves two looks towards `u` and `v` see alike ("echo") and which with opposite sign.
-
-    A kind of which there is next to nothing is left out.
-    """
+    """Return which waves two looks towards `u` and `v` see alike ("echo") and which with opposite sign."""
     east, north = wave_directions(size)
     facing = (east * u[0] + north * u[1]) * (east * v[0] + north * v[1])
     kinds = {
         "echo": np.clip(1.0 + facing / 0.1, 0.0, 1.0),
         "shading": np.clip((-facing - 0.2) / 0.2, 0.0, 1.0),
     }
-    return {kind: gain for kind, gain in kinds.items() if gain.mean() > 0.08}
+    return {kind: gain.astype(np.float32) for kind, gain in kinds.items()}
 
 
 def _of_sides(
     pair: Fields, first: Side, second: Side, gains: dict[str, FloatArray], reach: int
-) -> Iterator[tuple[str, Fields, Surface]]:
-    """Yield kind, fields and correlation of a side of one pass with a side of the other."""
-    values, weights, other, other_weights = pair
+) -> Iterator[tuple[str, float, Surface]]:
+    """Yield kind, sign and correlation of a side of one pass with a side of the other."""
+    values, weights, _, _ = pair
+    # A kind of wave of which there is next to nothing tells nothing.
+    gains = {kind: gain for kind, gain in gains.items() if gain.mean() > _LEAST_WAVES}
     known: Products | None = None
     for kind, filtered in zip(
         gains, fan_filters(values, weights, list(gains.values())), strict=True
@@ -192,7 +199,7 @@ def _of_sides(
         if kind == "shading" and surface is not None:
             sign, surface = _signed(found, surface)
         if surface is not None:
-            yield kind, (filtered, weights, sign * other, other_weights), surface
+            yield kind, sign, surface
 
 
 def _signed(found: Products, surface: Surface) -> tuple[float, Surface | None]:
@@ -227,8 +234,14 @@ def judge(
     cell_m: float,
     config: MatchConfig,
     prior_m2: FloatArray | None,
+    waves: dict[str, FloatArray] | None = None,
 ) -> Verdict:
-    """Choose the best shift of all correlations together, refine it below a cell, and weigh it."""
+    """Choose the best shift of all correlations together, refine it below a cell, and weigh it.
+
+    Parameters
+    ----------
+    waves : by which each wave of a channel counts in `refine`.
+    """
     total = np.sum([s.log_likelihood for s in surfaces.values()], axis=0)
     common = np.max([s.common for s in surfaces.values()], axis=0)
     reach = total.shape[0] // 2
@@ -246,7 +259,7 @@ def judge(
     if "objects" in gains:
         # The correlation of points with gains is a log-likelihood as it stands.
         gains["objects"] = 1.0
-    offset, covariance, lobe = refine(fields, gains, best, inner)
+    offset, covariance, lobe = refine(fields, gains, best, inner, waves)
     if covariance is None or np.abs(offset).max() > 1.5:
         return Verdict(best, nothing, evidence, reason="no clear peak")
     # A tenth of a cell is what two samplings of one ground leave of any peak (docs/registration.md).

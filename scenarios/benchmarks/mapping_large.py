@@ -26,6 +26,7 @@ from scenarios.metrics import percent_cut
 _CRS = "EPSG:32630"
 _ORIGIN_M = np.array([500_000.0, 5_600_000.0])
 _STEP_M, _COLUMN_M, _REACH_M, _ALTITUDE_M, _SPEED_M_S = 0.5, 0.5, 58.0, 15.0, 1.5
+_FLOOR_M = 40.0
 # What a slope does to the logarithm of the echo, two to three altitudes away; four looks in samples of 0.15 m.
 _SLOPE_GAIN, _LOOKS = 4.5, 12.0
 _PINGS, _PINGS_A_KEYFRAME, _APART_M, _TURN_M = 2000, 20, 45.0, 60.0
@@ -163,6 +164,31 @@ def _field(rng: np.random.Generator, exponent: float, size: int = 1024) -> Float
     return scaled
 
 
+def _at(field: FloatArray, places_m: FloatArray) -> FloatArray:
+    """Return a periodic field at places of the survey."""
+    cells = places_m - _ORIGIN_M
+    at = [cells[..., 1], cells[..., 0]]
+    values: FloatArray = map_coordinates(field, at, order=1, mode="grid-wrap")
+    return values
+
+
+def _true_range(
+    ground: FloatArray, truth_m: FloatArray, beneath: FloatArray, across: FloatArray,
+    starboard: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Return (n, m) the ground range, to starboard, of what a sonar draws at each column of a strip.
+
+    It knows a slant range and draws as if the floor were level: ground that lies h higher than that beneath the track
+    is drawn about h a / x nearer to it.
+    """
+    range_m = np.broadcast_to(across, (len(truth_m), len(across)))
+    for _ in range(4):
+        rise = _at(ground, truth_m[:, None, :] + range_m[..., None] * starboard) - beneath[:, None]
+        squared = across**2 + 2.0 * _ALTITUDE_M * rise - rise**2
+        range_m = np.sign(across) * np.sqrt(np.maximum(squared, 0.0))
+    return range_m
+
+
 def _seen(
     ground: FloatArray, albedo: FloatArray, truth_m: FloatArray, navigated_m: FloatArray,
     heading_rad: float, bias_rad: float, time_s: FloatArray, ping: int, index: int,
@@ -171,23 +197,26 @@ def _seen(
     """Return what a pass saw, at the places where its navigation has it."""
     across = np.arange(-_REACH_M, _REACH_M + 1e-9, _COLUMN_M)
     starboard = np.array([np.cos(heading_rad), -np.sin(heading_rad)])
-    cells = truth_m[:, None, :] - _ORIGIN_M + across[:, None] * starboard
-    at = [cells[..., 1], cells[..., 0]]
-    height = map_coordinates(ground, at, order=1, mode="grid-wrap")
-    outward = np.gradient(height, _COLUMN_M, axis=1) * np.sign(across)
-    level = map_coordinates(albedo, at, order=1, mode="grid-wrap")
-    level += _SLOPE_GAIN * np.clip(outward, -0.5, 0.3)
+    beneath = _at(ground, truth_m)
+    range_m = _true_range(ground, truth_m, beneath, across, starboard)
+    places = truth_m[:, None, :] + range_m[..., None] * starboard
+    height = _at(ground, places)
+    outward = (
+        _at(ground, places + 0.25 * starboard) - _at(ground, places - 0.25 * starboard)
+    ) / 0.5
+    level = _at(albedo, places)
+    level += _SLOPE_GAIN * np.clip(outward * np.sign(across), -0.5, 0.3)
     # Heights off the track err together over metres and lose their fine structure.
     broad = gaussian_filter(rng.normal(size=height.shape), 6.0)
     height = gaussian_filter(height, 4.0) + 0.3 * broad / broad.std() + 0.1 * rng.normal()
     n = len(truth_m)
     return ElevationStrip(
-        elevation_m=(height - 40.0).astype(np.float32),
+        elevation_m=(height - _FLOOR_M).astype(np.float32),
         sigma_m=np.full(height.shape, 0.3, np.float32),
         across_m=across,
         echo=(np.exp(level) * rng.gamma(_LOOKS, 1 / _LOOKS, height.shape)).astype(np.float32),
         shadow=np.zeros(height.shape, bool), time_s=time_s, ping=ping + np.arange(n),
-        easting_m=navigated_m[:, 0], northing_m=navigated_m[:, 1], depth_m=np.full(n, 25.0),
+        easting_m=navigated_m[:, 0], northing_m=navigated_m[:, 1], depth_m=_FLOOR_M - _ALTITUDE_M - beneath,
         heading_rad=np.full(n, heading_rad - bias_rad), altitude_m=np.full(n, _ALTITUDE_M),
         altitude_sigma_m=np.full(n, 0.1), crs=_CRS, pass_index=index,
     )  # fmt: skip
