@@ -30,15 +30,8 @@ from mapping.correlation import (
     refine,
     wave_directions,
 )
-from mapping.textures import (
-    OBJECTS,
-    PORT,
-    RELIEF,
-    STARBOARD,
-    MatchConfig,
-    Texture,
-    gather,
-)
+from mapping.texture_grid import OBJECTS, PORT, RELIEF, STARBOARD, gather
+from mapping.textures import MatchConfig, Texture
 from perception.records import FloatArray
 
 _SIDES = ((PORT, "port"), (STARBOARD, "starboard"))

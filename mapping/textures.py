@@ -1,22 +1,20 @@
-"""What of a strip can be matched: relief, echo texture of each side, objects; and its gridding."""
+"""What of a strip can be matched: relief, echo texture of each side, objects."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 from scipy.ndimage import uniform_filter
 
 from mapping.echo_places import placed_across
-from perception.records import ElevationStrip, FloatArray, Grid
+from perception.records import BoolArray, ElevationStrip, FloatArray, Grid
 
-# Channels of a `Texture`, in the order of its last axis.
-RELIEF, PORT, STARBOARD, OBJECTS = range(4)
-_CHANNELS = 4
+# What a cell's echo tells: that ground was seen there; its level, on either side of the sonar.
+SEEN, OF_PORT, OF_STARBOARD = 1, 2, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +39,22 @@ class MatchConfig:
 
 @dataclass(frozen=True, slots=True)
 class Texture:
-    """What of a strip can be matched: (n, m, 4) float32 values and weights, zero weight no data.
+    """What of a strip can be matched, (n, m) each but for the objects.
 
-    `relief_share` is the part of the relief's variance that its own sigma does not explain. `across_m`
-    (n, m) is where each cell truly lies to starboard of its line, as far as the floor's height is known.
+    Attributes
+    ----------
+    relief, relief_weight : float32, weight zero no data; `relief_share` is the part of the relief's variance that its
+        own sigma does not explain.
+    level, echo : float32 log echo, and what it may be used for: `SEEN`, `OF_PORT`, `OF_STARBOARD`, added up.
+    objects : (k, 3) line, column and size of each object, positive a hill, negative a crater.
+    across_m : where each cell truly lies to starboard of its line, as far as the floor's height is known.
     """
 
-    values: FloatArray
-    weights: FloatArray
+    relief: FloatArray
+    relief_weight: FloatArray
+    level: FloatArray
+    echo: npt.NDArray[np.uint8]
+    objects: FloatArray
     strip: ElevationStrip
     relief_share: float
     across_m: FloatArray
@@ -69,42 +75,53 @@ def texture(
         each line; with it they are placed where their slant range meets it.
     """
     config = config or MatchConfig()
-    n, m = strip.elevation_m.shape
-    values = np.zeros((n, m, _CHANNELS), np.float32)
-    weights = np.zeros((n, m, _CHANNELS), np.float32)
     size = _filter_size(strip, config.highpass_m)
-    relief_share = 0.0
-    seen = np.isfinite(strip.elevation_m) & np.isfinite(strip.sigma_m) & (strip.sigma_m > 0)
-    if seen.any():
-        # A floor keeps a few cells of great confidence from deciding alone.
-        sigma = np.where(seen, strip.sigma_m, 1.0)
-        sigma = np.maximum(sigma, np.median(sigma[seen]) * 0.5)
-        weight = np.where(seen, 1.0 / sigma**2, 0.0)
-        weight /= weight.max()
-        values[..., RELIEF] = _highpass(np.where(seen, strip.elevation_m, 0.0), weight, size)
-        weights[..., RELIEF] = weight
-        signal = float(np.average(values[..., RELIEF] ** 2, weights=weight))
-        noise = float(np.average(sigma**2, weights=weight))
-        relief_share = signal / (signal + noise)
+    relief, relief_weight, relief_share = _relief(strip, size)
     loud = np.isfinite(strip.echo) & (strip.echo > 0) & ~strip.shadow
+    level = _level(strip, loud, size, config.smooth_m)
+    # Near nadir an echo tells nothing about slope, and the two sides meet.
+    off_nadir = np.abs(strip.across_m) > 0.4 * np.nan_to_num(strip.altitude_m)[:, None]
+    side = np.where(strip.across_m < 0, OF_PORT, np.where(strip.across_m > 0, OF_STARBOARD, 0))
+    echo = np.where(loud & off_nadir, side, 0) + np.where(np.isfinite(strip.echo), SEEN, 0)
+    spikes = _landmarks(strip, level)
+    spikes[~np.isfinite(strip.echo)] = 0.0
+    objects = np.column_stack([*np.nonzero(spikes), spikes[np.nonzero(spikes)]])
+    return Texture(
+        relief, relief_weight, level, echo.astype(np.uint8), objects, strip, relief_share,
+        placed_across(strip, floor),
+    )  # fmt: skip
+
+
+def _relief(strip: ElevationStrip, size: tuple[int, int]) -> tuple[FloatArray, FloatArray, float]:
+    """Return heights less their mean over a box, their weights, and the part of their variance that is no noise."""
+    seen = np.isfinite(strip.elevation_m) & np.isfinite(strip.sigma_m) & (strip.sigma_m > 0)
+    if not seen.any():
+        nothing = np.zeros(seen.shape, np.float32)
+        return nothing, nothing, 0.0
+    # A floor keeps a few cells of great confidence from deciding alone.
+    sigma = np.where(seen, strip.sigma_m, 1.0)
+    sigma = np.maximum(sigma, np.median(sigma[seen]) * 0.5)
+    weight = np.where(seen, 1.0 / sigma**2, 0.0)
+    weight /= weight.max()
+    relief = _highpass(np.where(seen, strip.elevation_m, 0.0), weight, size)
+    signal = float(np.average(relief**2, weights=weight))
+    noise = float(np.average(sigma**2, weights=weight))
+    return relief, weight.astype(np.float32), signal / (signal + noise)
+
+
+def _level(
+    strip: ElevationStrip, loud: BoolArray, size: tuple[int, int], smooth_m: float
+) -> FloatArray:
+    """Return log echo less its mean over a box, evened in contrast."""
     # Power is averaged before the logarithm: single looks have a long tail of darkness in logarithms.
-    fine = _filter_size(strip, config.smooth_m, least=1)
+    fine = _filter_size(strip, smooth_m, least=1)
     power = uniform_filter(
         np.where(loud, strip.echo, 0.0).astype(np.float32), fine, mode="constant"
     )
     share = uniform_filter(loud.astype(np.float32), fine, mode="constant")
     level = np.log(np.maximum(power, 1e-6) / np.maximum(share, 1e-6))
     level = _highpass(np.clip(level, -2.0, 2.0), loud.astype(np.float32), size)
-    level = _evened(level, loud.astype(np.float32), (2 * size[0] + 1, 2 * size[1] + 1))
-    # Near nadir an echo tells nothing about slope, and the two sides meet.
-    off_nadir = np.abs(strip.across_m) > 0.4 * np.nan_to_num(strip.altitude_m)[:, None]
-    for side, channel in ((-1, PORT), (1, STARBOARD)):
-        values[..., channel] = level
-        weights[..., channel] = loud & off_nadir & (np.sign(strip.across_m) == side)
-    values[..., OBJECTS] = _landmarks(strip, level)
-    weights[..., OBJECTS] = np.isfinite(strip.echo)
-    values[weights == 0] = 0.0
-    return Texture(values, weights, strip, relief_share, placed_across(strip, floor))
+    return _evened(level, loud.astype(np.float32), (2 * size[0] + 1, 2 * size[1] + 1))
 
 
 def placed_anew(known: Texture, strip: ElevationStrip, floor: Grid | None) -> Texture:
@@ -227,72 +244,6 @@ def _spacings(strip: ElevationStrip) -> tuple[float, float]:
     step = float(np.median(np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))))
     spacing = float(np.median(np.diff(strip.across_m)))
     return max(step, 1e-3), max(spacing, 1e-3)
-
-
-@numba.njit(cache=True, nogil=True)
-def scatter(
-    values: FloatArray,
-    weights: FloatArray,
-    east: FloatArray,
-    north: FloatArray,
-    heading: FloatArray,
-    across: FloatArray,
-    west: float,
-    south: float,
-    cell: float,
-    size: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Average a texture's cells into a square grid (4, size, size), row 0 south.
-
-    Each datum is shared among the four cells around it: given whole to one cell, a regular lattice of data
-    on a regular grid beats, and every match is off by up to half a datum's spacing.
-    """
-    total = np.zeros((_CHANNELS, size, size), np.float32)
-    weight = np.zeros((_CHANNELS, size, size), np.float32)
-    for i in range(values.shape[0]):
-        c, s = np.cos(heading[i]), np.sin(heading[i])
-        for j in range(values.shape[1]):
-            x = (east[i] + c * across[i, j] - west) / cell - 0.5
-            y = (north[i] - s * across[i, j] - south) / cell - 0.5
-            col, row = int(np.floor(x)), int(np.floor(y))
-            if not (0 <= col < size - 1 and 0 <= row < size - 1):
-                continue
-            fx, fy = x - col, y - row
-            for k in range(_CHANNELS):
-                w = weights[i, j, k]
-                if w > 0:
-                    for dy in range(2):
-                        for dx in range(2):
-                            part = w * (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
-                            total[k, row + dy, col + dx] += part * values[i, j, k]
-                            weight[k, row + dy, col + dx] += part
-    for k in range(_CHANNELS):
-        for row in range(size):
-            for col in range(size):
-                if weight[k, row, col] > 0:
-                    total[k, row, col] /= weight[k, row, col]
-    return total, weight
-
-
-def gather(
-    texture: Texture, corner: tuple[float, float], cell_m: float, size: int
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return the texture on the square's grid (4, size, size), its weights, and its mean heading."""
-    strip = texture.strip
-    half = 0.5 * size * cell_m
-    east, north = strip.easting_m - corner[0] - half, strip.northing_m - corner[1] - half
-    along = np.abs(east * np.sin(strip.heading_rad) + north * np.cos(strip.heading_rad))
-    near = along < 1.5 * half
-    if not near.any():
-        nothing = np.zeros((_CHANNELS, size, size), np.float32)
-        return nothing, nothing.copy(), 0.0
-    rows = slice(int(np.argmax(near)), len(near) - int(np.argmax(near[::-1])))
-    values, weights = scatter(
-        texture.values[rows], texture.weights[rows], strip.easting_m[rows], strip.northing_m[rows],
-        strip.heading_rad[rows], texture.across_m[rows], corner[0], corner[1], cell_m, size,
-    )  # fmt: skip
-    heading = strip.heading_rad[near]
-    return values, weights, float(np.arctan2(np.sin(heading).mean(), np.cos(heading).mean()))
 
 
 def default_cell(strips: Sequence[ElevationStrip]) -> float:
