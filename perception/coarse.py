@@ -49,7 +49,7 @@ class CoarseSolver:
         self, z: FloatArray, a: FloatArray, gain: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the solution for a right-hand side on the grid."""
-        right = np.concatenate([z.ravel(), a.ravel()])
+        right = np.concatenate([z.ravel(), a.ravel()]).astype(float)
         gain = self.gain_inverse @ (gain - self.answer.T @ right)
         both = self.fields.solve(right) - self.answer @ gain
         half = z.size

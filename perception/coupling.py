@@ -10,26 +10,34 @@ import numpy as np
 from numba import njit
 from scipy import sparse
 
-from perception.bands import over_bands
+from perception.bands import in_threads, over_bands
 from perception.records import FloatArray, IntArray
 
 # Rows of nodes whose ties are gathered at once: some megabytes for a grid of a thousand columns.
 _BAND = 32
 
 
+# Blocks of nodes whose pull on the gains is summed apart: the same sums however many threads share them.
+_BLOCKS = 32
+
+
 @dataclass(frozen=True, slots=True)
 class Coupling:
-    """Normal matrix between the nodes' (z, then a) and the gains.
+    """Normal matrix between the nodes' z and a and the gains.
 
     Attributes
     ----------
     shape : of the grid.
-    height, albedo : (nodes, knots) single precision.
+    matrix : (nodes, knots) in single precision: heights the real part, albedo the imaginary one. One index serves both.
     """
 
     shape: tuple[int, int]
-    height: sparse.csr_matrix
-    albedo: sparse.csr_matrix
+    matrix: sparse.csr_matrix
+
+    @classmethod
+    def none(cls, shape: tuple[int, int], knots: int) -> Coupling:
+        """Return a coupling that ties nothing."""
+        return cls(shape, sparse.csr_matrix((shape[0] * shape[1], knots), dtype=np.complex64))
 
     @classmethod
     def of_rows(
@@ -51,113 +59,126 @@ class Coupling:
         """
         fold = 1 << depth
         nodes = (shape[0] - 1) // fold + 1, (shape[1] - 1) // fold + 1
-        row = rows[0] // (shape[1] - 1)
-        order = np.argsort(row // (fold * _BAND), kind="stable").astype(np.int32)
-        parts: tuple[list[sparse.csr_matrix], list[sparse.csr_matrix]] = ([], [])
-        carried = np.zeros((2, nodes[1], knots), np.float32)
-        for first in range(0, nodes[0], _BAND):
-            # A band's cells reach one row of nodes beyond it, which is the next band's first.
-            dense = np.zeros((2, _BAND + 1, nodes[1], knots), np.float32)
-            dense[:, 0] = carried
-            edge = np.searchsorted(row, [first * fold, (first + _BAND) * fold], sorter=order)
+        line = (rows[0] // ((shape[1] - 1) * fold)).astype(
+            np.int16 if nodes[0] < 2**15 else np.int32
+        )
+        order = np.argsort(line, kind="stable").astype(np.int32)
+
+        def one(first: int) -> sparse.csr_matrix:
+            # A node hears the cells before and after it.
+            count = min(_BAND, nodes[0] - first)
+            edge = np.searchsorted(line, [first - 1, first + count], sorter=order)
+            dense = np.zeros((count, nodes[1], knots, 2), np.float32)
             gather_coupling(
                 order[edge[0] : edge[1]], *rows, knot, share, shape[1] - 1, cell_m, depth, first,
                 dense,
             )  # fmt: skip
-            carried = dense[:, _BAND].copy()
-            for kind, part in enumerate(parts):
-                own = dense[kind, : min(_BAND, nodes[0] - first)]
-                part.append(_sparse(own.reshape(-1, knots)))
-        return cls(nodes, *(sparse.csr_matrix(sparse.vstack(part, "csr")) for part in parts))
+            return _sparse(dense.reshape(-1, knots, 2))
+
+        bands = in_threads(one, list(range(0, nodes[0], _BAND)))
+        return cls(nodes, sparse.csr_matrix(sparse.vstack(bands, "csr")))
 
     def coarser(self, prolongation: sparse.csr_matrix) -> Coupling:
         """Return the coupling of the grid that `prolongation` interpolates to this one."""
         turned = sparse.csr_matrix(prolongation.T, dtype=np.float32)
         nodes = self.shape[0] // 2 + 1, self.shape[1] // 2 + 1
-        return Coupling(nodes, turned @ self.height, turned @ self.albedo)
+        return Coupling(nodes, sparse.csr_matrix(turned @ self.matrix))
 
     def gains_of(self, z: FloatArray, a: FloatArray) -> FloatArray:
         """Return what fields add to the gains' equations (knots,)."""
-        out = np.zeros(self.height.shape[1])
-        for matrix, values in ((self.height, z), (self.albedo, a)):
-            gather(matrix.indptr, matrix.indices, matrix.data, values.reshape(-1), out)
-        return out
+        parts = np.zeros((_BLOCKS, self.matrix.shape[1]))
+        over_bands(
+            gather, _BLOCKS, self.matrix.nnz, *self._arrays(), z.reshape(-1), a.reshape(-1), parts
+        )
+        total: FloatArray = parts.sum(axis=0)
+        return total
 
-    def fields_of(self, gain: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def fields_of(
+        self, gain: FloatArray, precision: type[np.floating] = np.float64
+    ) -> tuple[FloatArray, FloatArray]:
         """Return what gains add to the equations of heights and albedo."""
-        out = []
-        for matrix in (self.height, self.albedo):
-            values = np.empty(self.shape[0] * self.shape[1])
-            over_bands(
-                scatter, len(values), matrix.nnz, matrix.indptr, matrix.indices, matrix.data, gain,
-                values,
-            )  # fmt: skip
-            out.append(values.reshape(self.shape))
-        return out[0], out[1]
+        z, a = np.empty(self.shape, precision), np.empty(self.shape, precision)
+        over_bands(
+            scatter, z.size, self.matrix.nnz, *self._arrays(), gain, z.reshape(-1), a.reshape(-1)
+        )
+        return z, a
 
     def dense(self) -> FloatArray:
         """Return the coupling as (2 nodes, knots)."""
-        return np.asarray(sparse.vstack([self.height, self.albedo]).toarray(), float)
+        both = self.matrix.toarray()
+        return np.concatenate([both.real, both.imag]).astype(float)
+
+    def _arrays(self) -> tuple[IntArray, IntArray, FloatArray]:
+        pairs = self.matrix.data.view(np.float32).reshape(-1, 2)
+        return self.matrix.indptr, self.matrix.indices, pairs
 
 
 def _sparse(dense: FloatArray) -> sparse.csr_matrix:
     start = np.zeros(len(dense) + 1, np.int32)
     start[1:] = np.cumsum(count_entries(dense))
-    column, value = np.empty(start[-1], np.int32), np.empty(start[-1], dense.dtype)
+    column, value = np.empty(start[-1], np.int32), np.empty((start[-1], 2), np.float32)
     take_entries(dense, column, value)
-    return sparse.csr_matrix((value, column, start), shape=dense.shape)
+    return sparse.csr_matrix((value.view(np.complex64)[:, 0], column, start), shape=dense.shape[:2])
 
 
 @njit(cache=True, nogil=True)
 def count_entries(dense):
-    """Return the number of entries of each row that are not zero."""
+    """Return the number of pairs of each row that are not zero."""
     out = np.zeros(dense.shape[0], np.int32)
     for i in range(dense.shape[0]):
         for j in range(dense.shape[1]):
-            out[i] += dense[i, j] != 0
+            out[i] += dense[i, j, 0] != 0 or dense[i, j, 1] != 0
     return out
 
 
 @njit(cache=True, nogil=True)
 def take_entries(dense, column, value):
-    """Write column and value of all entries that are not zero, row by row."""
+    """Write column and values of all pairs that are not zero, row by row."""
     k = 0
     for i in range(dense.shape[0]):
         for j in range(dense.shape[1]):
-            if dense[i, j] != 0:
-                column[k], value[k] = j, dense[i, j]
+            if dense[i, j, 0] != 0 or dense[i, j, 1] != 0:
+                column[k] = j
+                value[k, 0], value[k, 1] = dense[i, j, 0], dense[i, j, 1]
                 k += 1
 
 
 @njit(cache=True, nogil=True)
-def gather(start, column, value, x, out):
-    """Add the transpose of a sparse matrix applied to `x` (rows,)."""
-    for i in range(len(x)):
-        for k in range(start[i], start[i + 1]):
-            out[column[k]] += value[k] * x[i]
+def gather(first, last, start, column, value, z, a, out):
+    """Write blocks of nodes' part in the transpose of a coupling applied to `z` and `a` (nodes,)."""
+    blocks, size = out.shape[0], len(z)
+    for b in range(first, last):
+        for i in range(size * b // blocks, size * (b + 1) // blocks):
+            for k in range(start[i], start[i + 1]):
+                out[b, column[k]] += value[k, 0] * z[i] + value[k, 1] * a[i]
 
 
 @njit(cache=True, nogil=True)
-def scatter(first, last, start, column, value, gain, out):
-    """Write rows of a sparse matrix applied to `gain`."""
+def scatter(first, last, start, column, value, gain, z, a):
+    """Write nodes of a coupling applied to `gain`."""
     for i in range(first, last):
-        total = 0.0
+        of_z, of_a = 0.0, 0.0
         for k in range(start[i], start[i + 1]):
-            total += value[k] * gain[column[k]]
-        out[i] = total
+            of_z += value[k, 0] * gain[column[k]]
+            of_a += value[k, 1] * gain[column[k]]
+        z[i], a[i] = of_z, of_a
 
 
 @njit(cache=True, nogil=True)
 def gather_coupling(
     chosen, cell, weight, c_east, c_north, c_level, knot, share, cols, cell_m, depth, first, out
 ):
-    """Add to `out` (2, rows, cols, knots) what ties nodes of a grid 2^depth wider, from row `first`, to the gains."""
+    """Add to `out` (rows, cols, knots, 2) what ties nodes of a grid 2^depth wider, from row `first`, to the gains."""
     step = 1 << depth
     for i in chosen:
         r, c = cell[i] // cols, cell[i] % cols
         y, x = ((r % step) + 0.5) / step, ((c % step) + 0.5) / step
         for k in range(4):
             up, right = k // 2, k % 2
+            row, col = r // step + up - first, c // step + right
+            # The band's neighbours gather their own.
+            if row < 0 or row >= out.shape[0]:
+                continue
             fy = y if up else 1 - y
             fx = x if right else 1 - x
             z = (c_east[i] * (fy if right else -fy) + c_north[i] * (fx if up else -fx)) / (
@@ -165,5 +186,5 @@ def gather_coupling(
             ) + c_level[i] * fx * fy
             for m in range(knot.shape[1]):
                 v = weight[i] * share[i, m]
-                out[0, r // step + up - first, c // step + right, knot[i, m]] += v * z
-                out[1, r // step + up - first, c // step + right, knot[i, m]] += v * fx * fy
+                out[row, col, knot[i, m], 0] += v * z
+                out[row, col, knot[i, m], 1] += v * fx * fy

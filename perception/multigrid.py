@@ -23,12 +23,19 @@ from perception.level_kernels import (
     advance,
     apply_corners,
     apply_features,
+    begin,
+    coarsen_rows,
     dot_rows,
     prolong_rows,
+    read_equations,
     restrict_rows,
+    spread_equations,
 )
 from perception.records import FloatArray, IntArray
-from perception.stencils import coarsen_local, local_of_moments
+from perception.stencils import child_map, feature_map, packed_map
+
+# Heights, log-albedo and gains.
+Fields = tuple[FloatArray, FloatArray, FloatArray]
 
 # Nodes that are solved directly. More of them take no step off the solution and cost more than the grid they save.
 COARSEST_NODES = 1200
@@ -79,9 +86,12 @@ class FeatureData:
 
     def local(self) -> FloatArray:
         """Return the cells' matrices on their corners, packed (36, rows, cols)."""
-        out = np.zeros((36, *self.shape), np.float32)
-        over_bands(local_of_moments, self.shape[0], out.size, self.moments, self.cell_m, out)
-        return out
+        change = packed_map(feature_map(self.cell_m)).astype(np.float32)
+        return np.tensordot(change, self.moments, 1)
+
+    def child(self, number: int) -> FloatArray:
+        """Return what makes a parent's packed matrix (36) of a child's (10)."""
+        return packed_map(feature_map(self.cell_m) @ child_map(number))
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,12 +115,21 @@ class CornerData:
     def local(self) -> FloatArray:
         return self.packed
 
+    def child(self, number: int) -> FloatArray:
+        """Return what makes a parent's packed matrix (36) of a child's (36)."""
+        return packed_map(child_map(number))
+
 
 def coarser(data: FeatureData | CornerData) -> CornerData:
     """Return the data on cells twice as wide: exact for bilinear fields."""
     rows, cols = data.shape
-    out = np.zeros((36, rows // 2, cols // 2), np.float32)
-    over_bands(coarsen_local, rows // 2, out.size, data.local(), out)
+    out = np.empty((36, rows // 2, cols // 2), np.float32)
+    maps = sparse.csr_matrix(np.concatenate([data.child(k) for k in range(4)], axis=1))
+    fine = data.moments if isinstance(data, FeatureData) else data.packed
+    over_bands(
+        coarsen_rows, rows // 2, out.size, fine, maps.indptr, maps.indices,
+        maps.data.astype(np.float32), out,
+    )  # fmt: skip
     return CornerData(out)
 
 
@@ -121,12 +140,10 @@ class Tie:
     matrix: sparse.csr_matrix
     weight: FloatArray
     nodes: IntArray
-    read: sparse.csr_matrix = field(init=False)
     spread: sparse.csr_matrix = field(init=False)
 
     @classmethod
     def of(cls, matrix: sparse.csr_matrix, weight: FloatArray) -> Tie:
-        # In order now: `read` shares its values, which a sorting later on would move under it.
         matrix.sum_duplicates()
         used = np.zeros(matrix.shape[1], np.bool_)
         used[matrix.indices] = True
@@ -139,14 +156,21 @@ class Tie:
             (self.matrix.data, place[self.matrix.indices], self.matrix.indptr),
             shape=(self.matrix.shape[0], len(self.nodes)),
         )
-        object.__setattr__(self, "read", read)
         object.__setattr__(self, "spread", sparse.csr_matrix(read.T))
 
     def add(self, z: FloatArray, out: FloatArray) -> None:
         """Add the equations' normal matrix applied to `z`."""
-        if len(self.nodes):
-            at = self.read @ z.ravel()[self.nodes]
-            out.reshape(-1)[self.nodes] += self.spread @ (self.weight * at)
+        if not len(self.nodes):
+            return
+        at, m, s = np.empty(len(self.weight)), self.matrix, self.spread
+        over_bands(
+            read_equations, len(at), m.nnz, m.indptr, m.indices, m.data, self.weight,
+            z.reshape(-1), at,
+        )  # fmt: skip
+        over_bands(
+            spread_equations, len(self.nodes), s.nnz, s.indptr, s.indices, s.data, self.nodes, at,
+            out.reshape(-1),
+        )  # fmt: skip
 
     def coarser(self, nodes: tuple[int, int]) -> Tie:
         return Tie.of(sparse.csr_matrix(self.matrix @ prolongation_matrix(*nodes)), self.weight)
@@ -204,7 +228,7 @@ class Level:
             size = abs(self.tie.matrix)
             reach = self.tie.weight * np.asarray(size.sum(axis=1)).ravel()
             d_z += (size.T @ reach).reshape(d_z.shape)
-        return d_z, d_a
+        return d_z.astype(np.float32), d_a.astype(np.float32)
 
     def _largest_eigenvalue(self) -> float:
         """Return the largest eigenvalue of the diagonally scaled operator, by Lanczos' iteration.
@@ -213,8 +237,8 @@ class Level:
         """
         scale = [1 / np.sqrt(d) for d in self.diagonal]
         rng = np.random.default_rng(0)
-        v: list[FloatArray] = [rng.standard_normal(self.shape) for _ in scale]
-        before: list[FloatArray] = [np.zeros(self.shape) for _ in scale]
+        v: list[FloatArray] = [rng.standard_normal(self.shape, np.float32) for _ in scale]
+        before: list[FloatArray] = [np.zeros(self.shape, np.float32) for _ in scale]
         on: list[float] = []
         off: list[float] = []
         norm = float(np.sqrt(dot(v, v)))
@@ -236,20 +260,32 @@ class Level:
         rest = off[: len(on) - 1]
         return float(np.linalg.eigvalsh(np.diag(on) + np.diag(rest, 1) + np.diag(rest, -1))[-1])
 
-    def smooth(self, z: FloatArray, a: FloatArray, b_z: FloatArray, b_a: FloatArray) -> None:
-        """Damp the upper part of the spectrum of the error of (z, a) by a Chebyshev polynomial, in place."""
+    def smooth(
+        self, z: FloatArray, a: FloatArray, b_z: FloatArray, b_a: FloatArray, anew: bool = False
+    ) -> None:
+        """Damp the upper part of the spectrum of the error of (z, a) by a Chebyshev polynomial, in place.
+
+        `anew` : begin from zero, whatever (z, a) hold: saves an application of the operator.
+        """
         high, low = self.largest, self.largest / 10
         middle, half = (high + low) / 2, (high - low) / 2
         sigma = middle / half
         keep, gain, rho = 0.0, 1 / middle, 1 / sigma
-        s_z, s_a = np.zeros_like(z), np.zeros_like(a)
-        for _ in range(_SMOOTHING):
+        s_z, s_a = (
+            (np.empty_like(z), np.empty_like(a)) if anew else (np.zeros_like(z), np.zeros_like(a))
+        )
+        for k in range(_SMOOTHING):
+            following = 1 / (2 * sigma - rho)
+            if anew and k == 0:
+                for b, d, s, x in zip((b_z, b_a), self.diagonal, (s_z, s_a), (z, a), strict=True):
+                    over_bands(begin, x.shape[0], x.size, b, d, gain, s, x)
+                keep, gain, rho = following * rho, 2 * following / half, following
+                continue
             applied = self.apply(z, a)
             for b, y, d, s, x in zip(
                 (b_z, b_a), applied, self.diagonal, (s_z, s_a), (z, a), strict=True
             ):
                 over_bands(advance, x.shape[0], x.size, b, y, d, keep, gain, s, x)
-            following = 1 / (2 * sigma - rho)
             keep, gain, rho = following * rho, 2 * following / half, following
 
 
@@ -278,7 +314,7 @@ def add_times(x: Sequence[FloatArray], factor: float, y: Sequence[FloatArray]) -
 def prolong(coarse: FloatArray) -> FloatArray:
     """Interpolate nodes of a grid to the grid of half its cell, bilinearly."""
     rows, cols = coarse.shape
-    fine = np.empty((2 * rows - 1, 2 * cols - 1))
+    fine = np.empty((2 * rows - 1, 2 * cols - 1), coarse.dtype)
     over_bands(prolong_rows, fine.shape[0], fine.size, coarse, fine)
     return fine
 
@@ -286,7 +322,7 @@ def prolong(coarse: FloatArray) -> FloatArray:
 def restrict(fine: FloatArray) -> FloatArray:
     """Apply the transpose of `prolong`."""
     rows, cols = fine.shape
-    coarse = np.empty((rows // 2 + 1, cols // 2 + 1))
+    coarse = np.empty((rows // 2 + 1, cols // 2 + 1), fine.dtype)
     over_bands(restrict_rows, coarse.shape[0], fine.size, fine, coarse)
     return coarse
 
@@ -355,27 +391,30 @@ class Hierarchy:
         )
         return cls(levels, CoarseSolver.build(matrix, last.coupling.dense(), gain_block))
 
-    def cycle(
-        self, b_z: FloatArray, b_a: FloatArray, b_g: FloatArray, at: int = 0
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def cycle(self, b_z: FloatArray, b_a: FloatArray, b_g: FloatArray) -> Fields:
         """Return an approximate solution for the right-hand side: symmetric, and positive.
 
         Before and after the coarser grids' part the fields are smoothed; gains move on the coarsest grid alone, but
         what they and the fields do to one another's residual is taken along on every grid. Left out on the finest
         grid, or read there through the next one's, it costs little where looks cross; with one pass alone
-        it trebles the steps.
+        it trebles the steps. Fields are in single precision: what it rounds is a correction.
         """
+        z, a, gain = self._cycle(np.asarray(b_z, np.float32), np.asarray(b_a, np.float32), b_g, 0)
+        return z.astype(float), a.astype(float), gain
+
+    def _cycle(self, b_z: FloatArray, b_a: FloatArray, b_g: FloatArray, at: int) -> Fields:
         if at == len(self.levels) - 1:
-            return self.coarsest.solve(b_z, b_a, b_g)
+            z, a, gain = self.coarsest.solve(b_z, b_a, b_g)
+            return z.astype(np.float32), a.astype(np.float32), gain
         level = self.levels[at]
-        z, a = np.zeros(level.shape), np.zeros(level.shape)
-        level.smooth(z, a, b_z, b_a)
+        z, a = np.empty_like(b_z), np.empty_like(b_a)
+        level.smooth(z, a, b_z, b_a, anew=True)
         y_z, y_a = level.apply(z, a)
         felt = b_g - level.coupling.gains_of(z, a)
-        c_z, c_a, gain = self.cycle(restrict(b_z - y_z), restrict(b_a - y_a), felt, at + 1)
+        c_z, c_a, gain = self._cycle(restrict(b_z - y_z), restrict(b_a - y_a), felt, at + 1)
         z += prolong(c_z)
         a += prolong(c_a)
-        of_z, of_a = level.coupling.fields_of(gain)
+        of_z, of_a = level.coupling.fields_of(gain, np.float32)
         level.smooth(z, a, b_z - of_z, b_a - of_a)
         return z, a, gain
 

@@ -33,6 +33,10 @@ logger = logging.getLogger(__name__)
 
 # Nodes of a map whose error is judged as a whole; a larger one is so many patches.
 _PATCH = 50_000
+# The cycle leaves long waves and gains this slow at best; the first few steps cannot know, and would stop too soon.
+_SLOW = 0.05
+# Blocks of data rows whose pull on the gains is summed apart: the same sums however many threads share them.
+_BLOCKS = 32
 # Heights, log-albedo and gains.
 Fields = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -89,10 +93,12 @@ class Problem:
     height: Spectrum
     albedo: Spectrum
     mean_height: FloatArray
+    blocks: tuple[IntArray, IntArray] = field(init=False)
     hierarchy: Hierarchy = field(init=False)
     gain_block: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
+        self.blocks = self._blocks()
         block = self.gain_precision.copy()
         gain_normal(self.knot, self.share, self.weight, block)
         self.gain_block = block
@@ -107,6 +113,16 @@ class Problem:
         ]  # fmt: skip
         self.hierarchy = self._hierarchy(couplings)
 
+    def _blocks(self) -> tuple[IntArray, IntArray]:
+        """Return the data rows in the order of their cells' rows, and where blocks of them begin and end."""
+        line = self.cell // max(self.shape[1] - 1, 1)
+        # Sixteen bits are sorted by digits, in a tenth of the time.
+        order = np.argsort(
+            line.astype(np.uint16 if self.shape[0] < 2**16 else np.int64), kind="stable"
+        )
+        edge = np.linspace(0, self.shape[0], _BLOCKS + 1).astype(np.int64)
+        return order.astype(np.int32), np.searchsorted(line, edge, sorter=order)
+
     def _hierarchy(self, couplings: list[Coupling]) -> Hierarchy:
         rows, cols = self.shape
         moments = np.zeros((10, (rows - 1) * (cols - 1)), np.float32)
@@ -118,10 +134,7 @@ class Problem:
 
     def _untied(self) -> Hierarchy:
         """Return grids that solve fields and gains apart: slower, but positive however the ties are rounded."""
-        nothing = sparse.csr_matrix(
-            (self.shape[0] * self.shape[1], len(self.gain_block)), dtype=np.float32
-        )
-        return self._hierarchy([Coupling(self.shape, nothing, nothing)])
+        return self._hierarchy([Coupling.none(self.shape, len(self.gain_block))])
 
     def apply(self, z: FloatArray, a: FloatArray, gain: FloatArray) -> Fields:
         out_z, out_a = self.hierarchy.levels[0].apply(z, a)
@@ -129,10 +142,13 @@ class Problem:
         if len(self.cell):
             rows, cols = self.shape
             q = np.zeros((4, (rows - 1) * (cols - 1)))
-            rows_and_gain(
-                self.cell, self.weight, self.c_east, self.c_north, self.c_level, self.knot,
-                self.share, self._features(z, a), gain, q, out_g,
+            parts = np.zeros((_BLOCKS, len(out_g)))
+            over_bands(
+                rows_and_gain, _BLOCKS, 4 * len(self.cell), *self.blocks, self.cell, self.weight,
+                self.c_east, self.c_north, self.c_level, self.knot, self.share,
+                self._features(z, a), gain, q, parts,
             )  # fmt: skip
+            out_g += parts.sum(axis=0)
             spread_features(q.reshape(4, rows - 1, cols - 1), self.cell_m, out_z, out_a)
         return out_z, out_a, out_g
 
@@ -248,7 +264,7 @@ class Problem:
             following = dot(r, s)
             if following <= 0 and dot(r, r) > rounding:
                 return k + 1, False
-            if following <= tolerance**2 * _least_eigenvalue(alphas, betas):
+            if following <= tolerance**2 * min(_least_eigenvalue(alphas, betas), _SLOW):
                 return k + 1, True
             betas.append(following / rs)
             add_times(s, betas[-1], p)

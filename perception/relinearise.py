@@ -182,6 +182,8 @@ def _linearise(state: State, rows: Rows, first: bool, smooth: bool) -> Data:
     """Return the data rows about the present surface, robustly weighted."""
     config = state.config
     knot, share = state.basis.place(rows.angle_rad, rows.slant_m, rows.side.astype(np.int64))
+    # Two million data take their room: a knot's number is small, and so is what a share is good for.
+    knot, share = knot.astype(np.int16), share.astype(np.float32)
     if first:
         state.gain = state.basis.start(rows.ratio, knot)
     present = np.empty((4, state.shape[0] - 1, state.shape[1] - 1))

@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from perception.records import FloatArray
+
 
 @njit(cache=True, fastmath=True)
 def dual_features(z, a, cell, out):
@@ -52,22 +54,28 @@ def spread_features(q, cell, out_z, out_a):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def rows_and_gain(cell, weight, c_east, c_north, c_level, knot, share, features, gain, q, out):
-    """Add what the data rows make of `gain` to the cells' `q` (4, duals), and of `features` to `out` (knots)."""
-    for i in range(len(cell)):
-        j = cell[i]
-        w = weight[i]
-        e, n, c = c_east[i], c_north[i], c_level[i]
-        v = w * (e * features[0, j] + n * features[1, j] + c * features[2, j] + features[3, j])
-        g = 0.0
-        for k in range(knot.shape[1]):
-            out[knot[i, k]] += v * share[i, k]
-            g += gain[knot[i, k]] * share[i, k]
-        g *= w
-        q[0, j] += g * e
-        q[1, j] += g * n
-        q[2, j] += g * c
-        q[3, j] += g
+def rows_and_gain(
+    first, last, order, edge, cell, weight, c_east, c_north, c_level, knot, share, features, gain, q, out
+):  # fmt: skip
+    """Add what the data rows make of `gain` to the cells' `q` (4, duals), and of `features` to `out` (blocks, knots).
+
+    Blocks [first, last) of rows: ``order[edge[b] : edge[b + 1]]``. No two blocks share a cell.
+    """
+    for b in range(first, last):
+        for i in order[edge[b] : edge[b + 1]]:
+            j = cell[i]
+            w = weight[i]
+            e, n, c = c_east[i], c_north[i], c_level[i]
+            v = w * (e * features[0, j] + n * features[1, j] + c * features[2, j] + features[3, j])
+            g = 0.0
+            for k in range(knot.shape[1]):
+                out[b, knot[i, k]] += v * share[i, k]
+                g += gain[knot[i, k]] * share[i, k]
+            g *= w
+            q[0, j] += g * e
+            q[1, j] += g * n
+            q[2, j] += g * c
+            q[3, j] += g
 
 
 @njit(cache=True, fastmath=True)
@@ -110,69 +118,30 @@ def gain_normal(knot, share, weight, out):
                 out[knot[i, k], knot[i, q]] += weight[i] * share[i, k] * share[i, q]
 
 
-@njit(cache=True, nogil=True)
-def local_of_moments(first, last, moments, cell, out):
-    """Add rows of the cells' matrices on their corners (36, r, c) from those on features (10, r, c)."""
-    feature = np.zeros((4, 8))
+def feature_map(cell: float) -> FloatArray:
+    """Return the features (4) of a cell by its corners' z and a (8)."""
+    out = np.zeros((4, 8))
     for k in range(4):
-        feature[0, k] = (1.0 if k % 2 else -1.0) / (2 * cell)
-        feature[1, k] = (1.0 if k // 2 else -1.0) / (2 * cell)
-        feature[2, k] = 0.25
-        feature[3, 4 + k] = 0.25
-    full = np.empty((4, 4))
-    for i in range(first, last):
-        for j in range(moments.shape[2]):
-            if moments[9, i, j] == 0.0:
-                continue
-            k = 0
-            for p in range(4):
-                for q in range(p, 4):
-                    full[p, q] = full[q, p] = moments[k, i, j]
-                    k += 1
-            add_congruent(feature, full, out, i, j)
+        out[0, k] = (1 if k % 2 else -1) / (2 * cell)
+        out[1, k] = (1 if k // 2 else -1) / (2 * cell)
+    out[2, :4] = out[3, 4:] = 0.25
+    return out
 
 
-@njit(cache=True, nogil=True)
-def add_congruent(change, full, out, i, j):
-    """Add the upper triangle of ``change' full change`` to `out` (36, r, c) at (i, j)."""
-    m = full.shape[0]
-    half = np.zeros((m, 8))
-    for p in range(m):
-        for s in range(m):
-            v = full[p, s]
-            for q in range(8):
-                half[p, q] += v * change[s, q]
-    k = 0
-    for p in range(8):
-        for q in range(p, 8):
-            total = 0.0
-            for s in range(m):
-                total += change[s, p] * half[s, q]
-            out[k, i, j] += total
-            k += 1
-
-
-@njit(cache=True, nogil=True)
-def coarsen_local(first, last, fine, out):
-    """Add rows of the matrices of cells twice as wide (36, r / 2, c / 2): exact for bilinear fields."""
-    # Corner values of each child by those of its parent.
+def child_map(child: int) -> FloatArray:
+    """Return the corners' z and a (8) of one of four children by its parent's: bilinear."""
     line = np.array([[[1.0, 0.0], [0.5, 0.5]], [[0.5, 0.5], [0.0, 1.0]]])
-    child = np.zeros((4, 8, 8))
-    for di in range(2):
-        for dj in range(2):
-            for p in range(4):
-                for q in range(4):
-                    v = line[di, p // 2, q // 2] * line[dj, p % 2, q % 2]
-                    child[2 * di + dj, p, q] = v
-                    child[2 * di + dj, 4 + p, 4 + q] = v
-    full = np.empty((8, 8))
-    for i in range(2 * first, 2 * last):
-        for j in range(2 * out.shape[2]):
-            if fine[35, i, j] == 0.0:
-                continue
-            k = 0
-            for p in range(8):
-                for q in range(p, 8):
-                    full[p, q] = full[q, p] = fine[k, i, j]
-                    k += 1
-            add_congruent(child[2 * (i % 2) + j % 2], full, out, i // 2, j // 2)
+    return np.kron(np.eye(2), np.kron(line[child // 2], line[child % 2]))
+
+
+def packed_map(change: FloatArray) -> FloatArray:
+    """Return the matrix that takes packed symmetric F to packed ``change' F change``."""
+    size = change.shape[0]
+    first, second = np.triu_indices(size)
+    top, side = np.triu_indices(change.shape[1])
+    out = np.empty((len(top), len(first)))
+    for k, (p, q) in enumerate(zip(first, second, strict=True)):
+        unit = np.zeros((size, size))
+        unit[p, q] = unit[q, p] = 1.0
+        out[:, k] = (change.T @ unit @ change)[top, side]
+    return out

@@ -14,11 +14,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import sparse
 
-from perception import bands, multigrid
+from perception import bands, multigrid, posterior
 from perception.coarse import level_matrix, prior_matrix
 from perception.gain_basis import GainBasis
-from perception.level_kernels import prior_rows
-from perception.multigrid import Spectrum, Tie, prolong, restrict
+from perception.level_kernels import apply_corners, apply_features, prior_rows
+from perception.multigrid import FeatureData, Spectrum, Tie, coarser, prolong, restrict
 from perception.posterior import Problem
 from perception.rays import Soundings
 from perception.roughness import fit_spectrum, learn_roughness, random_floor, structure_function
@@ -410,3 +410,66 @@ def test_kernels_freshly_compiled_and_from_the_cache_agree_to_the_bit(tmp_path: 
     ]  # fmt: skip
     assert any(tmp_path.rglob("*.nbi"))
     assert said[0] == said[1]
+
+
+def test_a_coarser_grids_data_are_exact_for_bilinear_fields() -> None:
+    """What the wide cells' matrices make of a field is what the narrow cells' make of it, interpolated."""
+    rng = np.random.default_rng(20)
+    packed = np.empty((10, 16, 24), np.float32)
+    for cell in np.ndindex(16, 24):
+        root = rng.normal(size=(4, 4))
+        packed[:, *cell] = (root @ root.T)[np.triu_indices(4)]
+    data, none = FeatureData(packed, 0.7), (0.0, 0.0, 0.0)
+    for _ in range(2):
+        wide = coarser(data)
+        shape = wide.shape[0] + 1, wide.shape[1] + 1
+        z, a = rng.normal(size=shape), rng.normal(size=shape)
+        found = np.empty(shape), np.empty(shape)
+        apply_corners(0, shape[0], wide.packed, z, a, none, none, *found)
+        fine = prolong(z), prolong(a)
+        made = np.empty(fine[0].shape), np.empty(fine[0].shape)
+        rows = fine[0].shape[0]
+        if isinstance(data, FeatureData):
+            apply_features(0, rows, data.moments, *fine, data.cell_m, none, none, *made)
+        else:
+            apply_corners(0, rows, data.packed, *fine, none, none, *made)
+        for mine, exact in zip(found, made, strict=True):
+            assert_allclose(mine, restrict(exact), atol=1e-5 * np.abs(mine).max())
+        data = wide
+
+
+def test_kernels_in_single_precision_are_those_in_double_rounded() -> None:
+    rng = np.random.default_rng(21)
+    z, a = rng.normal(size=(2, 33, 49))
+    moments = rng.random((10, 32, 48)).astype(np.float32)
+    local = rng.random((36, 32, 48)).astype(np.float32)
+    priors = (0.1, 0.5, 3.0), (0.1, 1.0, 2.0)
+    made = []
+    for precision in (np.float64, np.float32):
+        u, v = z.astype(precision), a.astype(precision)
+        out = np.empty((6, 33, 49), precision)
+        apply_features(0, 33, moments, u, v, 0.7, *priors, out[0], out[1])
+        apply_corners(0, 33, local, u, v, *priors, out[2], out[3])
+        out[4] = prolong(u[:17, :25])
+        out[5, :17, :25] = restrict(u)
+        out[5, 17:], out[5, :, 25:] = 0, 0
+        assert prolong(u).dtype == precision
+        made.append(out)
+    assert_allclose(made[1], made[0], atol=2e-5 * np.abs(made[0]).max())
+
+
+@pytest.mark.usefixtures("many_grids")
+def test_a_large_maps_error_adds_up_over_its_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a posterior sigma in each patch: a map of four may be off by a whole one in all, and no more."""
+    problem = crossed_problem(np.random.default_rng(22))
+    start = (np.zeros(problem.shape), np.zeros(problem.shape), np.zeros(7))
+    right = problem.right_side()
+    exact, _ = problem.solve(start, right, tolerance=1e-6)
+    steps = []
+    for patches in (1, 4):
+        monkeypatch.setattr(posterior, "_PATCH", exact[0].size / patches)
+        found, used = problem.solve(start, right)
+        off = tuple(x - y for x, y in zip(found, exact, strict=True))
+        assert np.sqrt(multigrid.dot(off, problem.apply(*off))) < 0.5 * np.sqrt(patches)
+        steps.append(used)
+    assert steps[1] < steps[0]
