@@ -12,13 +12,15 @@ from scipy.spatial import cKDTree
 from mapping.overlaps import Window
 from mapping.pose_graph import Link
 from mapping.registration import Match
-from perception.records import FloatArray
+from perception.records import ElevationStrip, FloatArray
 
 # Small surveys compare every square; large ones, in the last round, about one in two keyframes: twice as many
 # would narrow the track by a few per cent only (docs/pose-graph.md).
 _ALL_SQUARES = 2000
 # However many squares match, so much evidence (log-likelihood ratio) is asked of each: the most that can be let off.
 _MOST_RELIEF = 3.0
+# Pairs of passes are kept apart by more than any survey is wide.
+_APART_M = 1e9
 
 
 def enough(
@@ -50,19 +52,51 @@ def _promise(
     """Return the evidence per area that the same two passes had nearest to each window; 0 where none."""
     if not before:
         return None
-    # Pairs of passes are kept apart by more than any survey is wide.
-    apart_m = 1e9
     pairs = {(w.first, w.second) for w, _ in before} | {(w.first, w.second) for w in windows}
     number = {pair: i for i, pair in enumerate(sorted(pairs))}
 
     def places(chosen: Sequence[Window]) -> FloatArray:
         return np.array(
-            [(apart_m * number[w.first, w.second], w.easting_m, w.northing_m) for w in chosen]
+            [(_APART_M * number[w.first, w.second], w.easting_m, w.northing_m) for w in chosen]
         )
 
     density = np.array([m.evidence / w.side_m**2 for w, m in before])
     distance, index = cKDTree(places([w for w, _ in before])).query(places(windows))
-    return np.where(distance < 0.5 * apart_m, density[index], 0.0)
+    return np.where(distance < 0.5 * _APART_M, density[index], 0.0)
+
+
+def without(
+    windows: Sequence[Window], held: Sequence[Window], strips: Sequence[ElevationStrip]
+) -> list[Window]:
+    """Return the windows of which no held one shows the same two passes at nearly the same lines.
+
+    Half a square along both tracks counts as the same, wherever the tracks have been moved in between.
+    """
+    if not held:
+        return list(windows)
+    step_m = [
+        float(np.median(np.hypot(np.diff(s.easting_m), np.diff(s.northing_m))))
+        if len(s.ping) > 1
+        else 1.0
+        for s in strips
+    ]
+    pairs = {(w.first, w.second) for w in (*held, *windows)}
+    number = {pair: i for i, pair in enumerate(sorted(pairs))}
+
+    def lines(chosen: Sequence[Window]) -> FloatArray:
+        return np.array(
+            [
+                (
+                    _APART_M * number[w.first, w.second],
+                    w.first_line * step_m[w.first],
+                    w.second_line * step_m[w.second],
+                )
+                for w in chosen
+            ]
+        ).reshape(-1, 3)
+
+    distance, _ = cKDTree(lines(held)).query(lines(windows), p=np.inf)
+    return [w for w, d in zip(windows, distance, strict=True) if d > 0.5 * w.side_m]
 
 
 def believed(matches: Sequence[Match]) -> list[Match]:

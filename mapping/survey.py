@@ -13,7 +13,7 @@ from mapping.comparison_memory import ComparisonMemory
 from mapping.crossings import height_steps
 from mapping.fixes import PositionFix
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
-from mapping.link_choice import apart, enough
+from mapping.link_choice import apart, enough, without
 from mapping.overlaps import Window, find_overlaps
 from mapping.placing import at_lines, bridge, on_track
 from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution
@@ -239,7 +239,7 @@ def _rounds(given: _Given, known: CorrectedSurvey | None) -> _State:
             if not before or not state.found:
                 break
             # Nearer passes are tied now: farther ones have come within reach of a search.
-            state = _round(given, state, part, last, known)
+            state = _round(given, state, part, last, known, again=True)
             if state.rounds[-1].beyond > 0.9 * before:
                 break
         if not state.found or (number >= len(squares) and state.rounds[-1].moved_m < settled_m):
@@ -260,15 +260,26 @@ def _begun(given: _Given, known: CorrectedSurvey | None) -> _State:
 
 
 def _round(
-    given: _Given, state: _State, part: float, last: bool, known: CorrectedSurvey | None
+    given: _Given,
+    state: _State,
+    part: float,
+    last: bool,
+    known: CorrectedSurvey | None,
+    again: bool = False,
 ) -> _State:
-    """Compare squares of `part` of a swath on the track so far, and solve the graph of what matched."""
+    """Compare squares of `part` of a swath on the track so far, and solve the graph of what matched.
+
+    Where the same width is compared `again`, what was matched and believed stands and only the rest is compared.
+    """
     config, keyframes = given.config, given.keyframes
     side_m = max(part * given.width_m, least_square_m(given.cell_m))
     corrected = on_track(given.thin, keyframes, state.solution)
     every = find_overlaps(corrected, side_m)
     reached, expected = _within_reach(given, state, every)
-    windows = _worth_comparing(reached, state, len(keyframes), last, known)
+    held = tuple(r for r in state.found if r.used) if again else ()
+    windows = _worth_comparing(
+        without(reached, [r.window for r in held], given.thin), state, len(keyframes), last, known
+    )
     compared = given.memory.compared if given.memory else 0
     results, links = register(
         corrected, given.textures, keyframes, state.solution, windows,
@@ -276,15 +287,19 @@ def _round(
         given.floor, given.progress, f"registering, round {len(state.rounds) + 1}",
         np.array([expected[_place(w)] for w in windows]), given.memory,
     )  # fmt: skip
+    links = [*(state.links if again else ()), *links]
     steps = height_steps(corrected, keyframes, state.solution, links)
     after = solve(keyframes, links, given.ties, config.graph, steps=steps)
     used = iter(after.link_used)
-    found = tuple(Registration(w, m, bool(next(used)) if m.accepted else False) for w, m in results)
+    every_result = [*((r.window, r.match) for r in held), *results]
+    found = tuple(
+        Registration(w, m, bool(next(used)) if m.accepted else False) for w, m in every_result
+    )
     moved = after.correction_m - state.solution.correction_m
     said = Round(
         floor="soundings" if given.floor is None else "map",
         square_m=side_m,
-        compared=len(found),
+        compared=len(results),
         accepted=len(links),
         used=sum(r.used for r in found),
         beyond=len(every) - len(reached),
@@ -293,13 +308,14 @@ def _round(
         error_before=after.error_before,
         error_after=after.error_after,
         passes=len(given.thin),
-        anew=given.memory.compared - compared if given.memory else len(found),
+        anew=given.memory.compared - compared if given.memory else len(results),
     )
     logger.info("round %d: %s", len(state.rounds) + 1, said)
     believed_here = zip((r.window for r in found if r.match.accepted), links, strict=True)
     kept = _trusted(tuple(believed_here), after.link_used)
+    pool = state.pool[: len(state.pool) - len(held)]
     return _State(
-        after, (*state.rounds, said), found, (*state.pool, *kept), tuple(x for _, x in kept),
+        after, (*state.rounds, said), found, (*pool, *kept), tuple(x for _, x in kept),
         _trusted(steps, after.step_used),
     )  # fmt: skip
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from mapping.link_choice import apart, believed, enough
+from mapping.link_choice import apart, believed, enough, without
 from mapping.overlaps import Window
 from mapping.pose_graph import Link
 from mapping.registration import Match
+from tests.mapping.worlds import crossed_legs, fly, make_world
 
 
 def window(east: float, side_m: float = 30.0, second: int = 1) -> Window:
@@ -65,3 +68,16 @@ def test_of_squares_over_one_ground_the_best_known_is_kept_and_neighbours_all() 
     assert [w for w, _ in apart(pool)] == [narrow, beside]
     other = (window(0.0, 60.0, second=2), link(2.0))
     assert [w for w, _ in apart([*pool, other])] == [narrow, beside, other[0]]
+
+
+def test_a_square_is_not_compared_again_where_its_passes_were_matched_at_the_same_lines() -> None:
+    """The tracks may have moved by more than a square in between; the lines tell."""
+    rng = np.random.default_rng(0)
+    world = make_world(rng, size=64)
+    strips = [f.strip for f in fly(world, crossed_legs(), rng, None, step_m=2.0)]
+    seen = Window(0, 1, 500.0, 0.0, 30.0, 40.0, 60.0, 1.0)
+    moved = replace(seen, easting_m=620.0, first_line=43.0, second_line=57.0)
+    elsewhere = replace(seen, first_line=70.0, second_line=30.0)
+    other = replace(seen, second=2)
+    assert without([moved, elsewhere, other], [seen], strips) == [elsewhere, other]
+    assert without([moved], [], strips) == [moved]

@@ -1,0 +1,91 @@
+"""Covariances from one elimination, and who is doubted, against GTSAM's own answers on the unreduced graph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gtsam as typed_gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, E, H
+
+from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
+from mapping.pose_graph import GraphConfig, HeightStep, Link, build, gauss_newton
+from mapping.pose_graph_root import Root
+from mapping.pose_graph_solve import LinearGraph, consistent, solve
+from tests.mapping.test_pose_graph import end_fixes, flights, true_links
+
+gtsam: Any = typed_gtsam
+
+Survey = tuple[Keyframes, list[Link], list[KeyframeFix], list[HeightStep]]
+
+
+def survey(seed: int, wrong: float = 0.0) -> Survey:
+    rng = np.random.default_rng(seed)
+    flown = flights(rng)
+    strips = [f.strip for f in flown]
+    keyframes = choose_keyframes(strips, 15.0)
+    links = true_links(flown, keyframes, rng)
+    for i in rng.choice(len(links), int(wrong * len(links)), replace=False):
+        links[i] = replace(links[i], shift_m=links[i].shift_m + rng.uniform(3.0, 15.0, 2))
+    ties = tie_fixes(end_fixes(flown, rng), strips, keyframes, 4.0)
+    return keyframes, links, ties, [HeightStep(0, 3, 0.1, 0.05), HeightStep(1, 4, -0.1, 0.05)]
+
+
+def test_answer_and_covariances_are_those_of_the_unreduced_graph() -> None:
+    keyframes, links, ties, steps = survey(1)
+    config = GraphConfig(shared=0.8)
+    ours = solve(keyframes, links, ties, config, robust=False, steps=steps)
+    graph, start, _ = build(keyframes, links, ties, config, steps)
+    result = gtsam.GaussNewtonOptimizer(graph, start, gauss_newton()).optimize()
+    marginals = gtsam.Marginals(graph, result)
+    for k in range(len(keyframes)):
+        np.testing.assert_allclose(ours.correction_m[k], result.atVector(E(k)), atol=1e-7)
+        np.testing.assert_allclose(
+            ours.covariance_m2[k], marginals.marginalCovariance(E(k)), rtol=1e-6, atol=1e-9
+        )
+    for p in range(6):
+        sigma = np.sqrt(np.diag(marginals.marginalCovariance(B(p))))
+        np.testing.assert_allclose(ours.pass_sigma[p], sigma, rtol=1e-6)
+        sigma = np.sqrt(np.diag(marginals.marginalCovariance(H(p))))
+        np.testing.assert_allclose(ours.height_sigma_m[p], sigma[0], rtol=1e-6)
+    assert ours.error_after == pytest.approx(graph.error(result), rel=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.1, 0.4])
+def test_the_same_registrations_are_doubted_as_by_gtsam_on_the_unreduced_graph(
+    wrong: float,
+) -> None:
+    keyframes, links, ties, steps = survey(2, wrong)
+    config = GraphConfig()
+    ours = consistent(LinearGraph(keyframes, links, ties, config, steps), config)
+    graph, start, doubtful = build(keyframes, links, ties, config, steps)
+    start = gtsam.GaussNewtonOptimizer(graph, start, gauss_newton()).optimize()
+    parameters = gtsam.GncGaussNewtonParams(gauss_newton())
+    parameters.setAllowNonNoiseModelFactors(True)
+    parameters.setKnownInliers([f for f in range(graph.size()) if f not in set(doubtful)])
+    peer = gtsam.GncGaussNewtonOptimizer(graph, start, parameters)
+    peer.setInlierCostThresholdsAtProbability(1.0 - config.outlier_probability)
+    peer.optimize()
+    theirs = np.asarray(peer.getWeights())[doubtful] > 0.5
+    assert (ours != theirs).sum() <= 0.01 * len(ours)
+
+
+def test_columns_draws_and_the_selected_inverse_are_one_covariance() -> None:
+    keyframes, links, ties, steps = survey(3)
+    linear = LinearGraph(keyframes, links, ties, GraphConfig(), steps)
+    net, _ = linear.net(linear.graph(np.ones(len(linear.doubtful))))
+    root = Root.of(net)
+    n = len(root.begin) - 1
+    dense = np.zeros((n, n))
+    dense[np.repeat(np.arange(n), np.diff(root.begin)), root.column] = root.value
+    covariance = np.linalg.inv(dense.T @ dense)
+    assert root.half_log_det == pytest.approx(np.linalg.slogdet(dense)[1])
+    np.testing.assert_allclose(root.columns(np.arange(n)), covariance, rtol=1e-6, atol=1e-9)
+    keys = [E(k) for k in range(len(keyframes))]
+    at = root.positions(keys)
+    expected = covariance[at[:, :, None], at[:, None, :]]
+    np.testing.assert_allclose(root.covariances(keys), expected, rtol=1e-6, atol=1e-9)
+    drawn = root.draws(4000, np.random.default_rng(0))[at[:, 0]]
+    np.testing.assert_allclose((drawn**2).mean(axis=1), expected[:, 0, 0], rtol=0.12)
