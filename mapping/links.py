@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,8 +17,25 @@ from perception.records import ElevationStrip, FloatArray, Grid
 _STEPS = 64
 
 
+@dataclass(frozen=True, slots=True)
+class PassFacts:
+    """What its links need of a pass: usual way between lines, and how uneven the floor is beneath its track."""
+
+    step_m: float
+    unevenness_m: float
+
+    @classmethod
+    def of(cls, strip: ElevationStrip) -> PassFacts:
+        """Measure a strip."""
+        steps = np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))
+        beneath = -(strip.depth_m + strip.altitude_m)
+        unevenness_m = float(np.nanstd(beneath)) if np.isfinite(beneath).any() else np.nan
+        return cls(max(float(np.median(steps)), 1e-3) if len(steps) else 1.0, unevenness_m)
+
+
 def link_of(
     strips: Sequence[ElevationStrip],
+    facts: Mapping[int, PassFacts],
     keyframes: Keyframes,
     solution: Solution,
     window: Window,
@@ -29,13 +47,17 @@ def link_of(
 
     What a match tells of a pass is the mean of its correction over the way along which it saw the square. Two
     keyframes, about a quarter of the square before and after its middle, have nearly that mean.
+
+    Parameters
+    ----------
+    facts : of the two strips at least, by their number.
     """
     centre = np.array([window.easting_m, window.northing_m])
     unknown_m = None if floor is None else _typical_sigma(floor, window)
     covariance = result.covariance_m2 + _LEFT_OVER_M**2 * np.eye(2)
     blends, offsets, ground = [], [], []
     for strip, line in ((window.first, window.first_line), (window.second, window.second_line)):
-        blend, left_m = blended(strips[strip], strip, line, window.side_m, keyframes)
+        blend, left_m = blended(facts[strip].step_m, strip, line, window.side_m, keyframes)
         correction = blend.of(solution.correction_m)
         place = blend.of(np.column_stack([keyframes.easting_m, keyframes.northing_m]))
         offset = centre - place - correction
@@ -46,7 +68,7 @@ def link_of(
         covariance = covariance + config.walk_m2_per_m * left_m * np.eye(2)
         nearest = keyframes.nearest(strip, line)
         covariance = covariance + _misplacement(
-            strips[strip], keyframes, nearest, offset, unknown_m
+            strips[strip], facts[strip], keyframes, nearest, offset, unknown_m
         )
     return Link(
         first=keyframes.nearest(window.first, window.first_line),
@@ -61,28 +83,27 @@ def link_of(
 
 
 def blended(
-    strip: ElevationStrip, index: int, line: float, side_m: float, keyframes: Keyframes
+    step_m: float, index: int, line: float, side_m: float, keyframes: Keyframes
 ) -> tuple[Blend, float]:
     """Return the two keyframes that stand for a pass's mean over a square, and what they miss of a walk.
 
     Parameters
     ----------
-    line : mean line of the strip that saw the square; `side_m` its width.
+    step_m : usual way between lines of pass `index`.
+    line : mean line of the pass that saw the square; `side_m` its width.
 
     Returns
     -------
     blend, and the variance by which a walk's mean over the square differs from the blend's, in metres of
     way (times q^2).
     """
-    steps = np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))
-    step = max(float(np.median(steps)), 1e-3) if len(steps) else 1.0
-    reach = 0.25 * side_m / step
+    reach = 0.25 * side_m / step_m
     low, high = (keyframes.nearest(index, line + d) for d in (-reach, reach))
     if low == high:
         first, last = int(keyframes.starts[index]), int(keyframes.starts[index + 1]) - 1
         towards = 1 if line > keyframes.line[low] else -1
         low, high = sorted((low, int(np.clip(low + towards, first, last))))
-    at = (keyframes.line[[low, high]] - line) * step
+    at = (keyframes.line[[low, high]] - line) * step_m
     share = 0.5 if low == high else float(np.clip(-at[0] / (at[1] - at[0]), 0.0, 1.0))
     return Blend(low, high, share), _missed(at, share, side_m)
 
@@ -125,6 +146,7 @@ def _typical_sigma(floor: Grid, window: Window) -> float | None:
 
 def _misplacement(
     strip: ElevationStrip,
+    facts: PassFacts,
     keyframes: Keyframes,
     keyframe: int,
     offset_m: FloatArray,
@@ -139,8 +161,7 @@ def _misplacement(
     starboard = np.array([np.cos(heading), -np.sin(heading)])
     line = int(keyframes.line[keyframe])
     altitude = float(np.nan_to_num(strip.altitude_m[line]))
-    beneath = -(strip.depth_m + strip.altitude_m)
-    unevenness = float(np.nanstd(beneath)) if np.isfinite(beneath).any() else 0.1 * altitude
+    unevenness = facts.unevenness_m if np.isfinite(facts.unevenness_m) else 0.1 * altitude
     away = max(abs(float(offset_m @ starboard)), altitude, 1e-6)
     unknown_m = _UNKNOWN_RELIEF * unevenness if unknown_m is None else unknown_m
     sigma = unknown_m * altitude / away

@@ -14,7 +14,7 @@ from mapping.fusion import default_cell as default_fusion_cell
 from mapping.fusion import fuse
 from mapping.keyframes import Keyframes
 from mapping.link_choice import believed
-from mapping.links import link_of
+from mapping.links import PassFacts, link_of
 from mapping.overlaps import Window
 from mapping.placed import extent
 from mapping.placed import placed as strip_placed
@@ -119,10 +119,12 @@ def register(
     if memory is not None:
         memory.keep(given, recalled, matches)
     results = list(zip(windows, believed(matches), strict=True))
+    seen = {index for w, m in results if m.accepted for index in (w.first, w.second)}
+    facts = {index: PassFacts.of(corrected[index]) for index in seen}
 
     def link(window: Window, result: Match) -> Link:
         def make() -> Link:
-            return link_of(corrected, keyframes, solution, window, result, graph, floor)
+            return link_of(corrected, facts, keyframes, solution, window, result, graph, floor)
 
         return make() if memory is None else memory.link(window, cell_m, make)
 

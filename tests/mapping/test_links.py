@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapping.keyframes import choose_keyframes
-from mapping.links import _missed, blended
+from mapping.links import PassFacts, _missed, blended
 from mapping.pose_graph import Blend, Link
 from mapping.pose_graph_solve import solve
 from tests.mapping.worlds import Drift, World, fly
@@ -42,12 +42,12 @@ def test_a_square_hangs_on_keyframes_about_a_quarter_in_and_their_mean_is_its_mi
     strip = fly(world, legs, np.random.default_rng(0), Drift(0.0, 0.0, 0.0))[0].strip
     keyframes = choose_keyframes([strip], 10.0)
     for line in (37.0, 150.0, 233.3):
-        blend, left = blended(strip, 0, line, 40.0, keyframes)
+        blend, left = blended(PassFacts.of(strip).step_m, 0, line, 40.0, keyframes)
         assert blend.low < blend.high
         assert blend.of(keyframes.line.astype(float)) == pytest.approx(line, abs=1e-9)
         assert left < 40.0 / 24
     # Squares smaller than the way between keyframes hang on the two beside.
-    small, _ = blended(strip, 0, 150.0, 4.0, keyframes)
+    small, _ = blended(PassFacts.of(strip).step_m, 0, 150.0, 4.0, keyframes)
     assert small.high == small.low + 1
     assert small.of(keyframes.line.astype(float)) == pytest.approx(150.0, abs=1e-9)
 
