@@ -41,6 +41,9 @@ class GraphConfig:
     start_with_fixes_m : the same where fixes are given, which then decide.
     shared : correlation of these errors from pass to pass of a dive: 0 each its own, near 1 one
         instrument's constant. `mapping.sharing` chooses it by what the survey says.
+    range_scale : 1-sigma of what all passes misjudge of distances across the track in common: sound speed (3 m/s are 0.2 %),
+        altitude, the second order of unknown relief. It is not estimated, for nothing
+        else in a survey tells it, but it is part of every claimed covariance.
     height_m : 1-sigma of a strip's height offset (depth sensor, tide left over), where the survey does not
         say otherwise (`mapping.sharing`).
     outlier_probability : chance of refusing a good registration (chi-square tail of the GNC threshold).
@@ -53,6 +56,7 @@ class GraphConfig:
     shared: float = 0.0
     start_m: float = 2.0
     start_with_fixes_m: float = 300.0
+    range_scale: float = 0.002
     height_m: float = 0.1
     outlier_probability: float = 0.01
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import gtsam as typed_gtsam
@@ -214,6 +215,56 @@ def solve(
         len(keyframes), solution.link_used.sum(), n_links, solution.error_before, solution.error_after,
     )  # fmt: skip
     return solution
+
+
+def with_range_scale(
+    solution: Solution,
+    keyframes: Keyframes,
+    links: Sequence[Link],
+    fixes: Sequence[KeyframeFix],
+    steps: Sequence[HeightStep] = (),
+) -> Solution:
+    """Return a solution whose covariances hold what a range scale that all passes have in common would do to it.
+
+    Ground at a from the track is drawn at a (1 + k), so neighbours that look at each other are registered too near or
+    too far by the same part of their distance, again and again across a survey, and no covariance of single
+    registrations grows as that does. k is considered and not estimated (Schmidt 1966): with s the answer's change per k,
+    ``C + sigma_k^2 s s'``.
+
+    Parameters
+    ----------
+    links, fixes, steps : of the solution, in its order.
+    """
+    config = solution.config
+    if solution.root is None or not config.range_scale:
+        return solution
+    pulls = [
+        replace(link, shift_m=_range_effect(keyframes, link))
+        for link, used in zip(links, solution.link_used, strict=True)
+        if used
+    ]
+    still = [
+        replace(fix, correction_m=np.zeros(2))
+        for fix, used in zip(fixes, solution.fix_used, strict=True)
+        if used
+    ]
+    # Heights have no part in it.
+    linear = LinearGraph(keyframes, pulls, still, config)
+    values = linear.optimum(np.ones(len(linear.doubtful)))
+    change = config.range_scale * np.array([values.at(E(k)) for k in range(len(keyframes))])
+    spread = change[:, :, None] * change[:, None, :]
+    return replace(solution, covariance_m2=solution.covariance_m2 + spread)
+
+
+def _range_effect(keyframes: Keyframes, link: Link) -> FloatArray:
+    """Return how the shift (2,) that a registration finds changes per unit of range scale."""
+    drawn = []
+    for k, offset in ((link.first, link.first_offset_m), (link.second, link.second_offset_m)):
+        heading = keyframes.heading_rad[k]
+        starboard = np.array([np.cos(heading), -np.sin(heading)])
+        drawn.append((offset @ starboard) * starboard)
+    effect: FloatArray = drawn[0] - drawn[1]
+    return effect
 
 
 def log_evidence(

@@ -16,7 +16,7 @@ import numpy as np
 
 from mapping.keyframes import KeyframeFix, Keyframes
 from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution
-from mapping.pose_graph_solve import log_evidence, solve
+from mapping.pose_graph_solve import log_evidence, solve, with_range_scale
 
 logger = logging.getLogger(__name__)
 
@@ -61,8 +61,20 @@ def solve_shared(
 ) -> Solution:
     """Solve the graph under the correlation between passes that has the greatest evidence.
 
-    All are weighed over the same registrations and fixes, those that the first assumption finds consistent.
+    All are weighed over the same registrations and fixes, those that the first assumption finds consistent. The
+    covariances hold what a range scale in common adds.
     """
+    solution = _most_evident(keyframes, links, fixes, config, steps)
+    return with_range_scale(solution, keyframes, links, fixes, steps)
+
+
+def _most_evident(
+    keyframes: Keyframes,
+    links: Sequence[Link],
+    fixes: Sequence[KeyframeFix],
+    config: GraphConfig,
+    steps: Sequence[HeightStep],
+) -> Solution:
     first = solve(keyframes, links, fixes, config, steps=steps)
     if len(keyframes.starts) < 3:
         return first

@@ -13,7 +13,7 @@ from gtsam.symbol_shorthand import B, E, H
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
 from mapping.pose_graph import GraphConfig, HeightStep, Link, build, gauss_newton
 from mapping.pose_graph_root import Root
-from mapping.pose_graph_solve import LinearGraph, consistent, solve
+from mapping.pose_graph_solve import LinearGraph, consistent, solve, with_range_scale
 from tests.mapping.test_pose_graph import end_fixes, flights, true_links
 
 gtsam: Any = typed_gtsam
@@ -89,3 +89,28 @@ def test_columns_draws_and_the_selected_inverse_are_one_covariance() -> None:
     np.testing.assert_allclose(root.covariances(keys), expected, rtol=1e-6, atol=1e-9)
     drawn = root.draws(4000, np.random.default_rng(0))[at[:, 0]]
     np.testing.assert_allclose((drawn**2).mean(axis=1), expected[:, 0, 0], rtol=0.12)
+
+
+def test_a_range_scale_in_common_widens_the_claim_by_what_it_does_to_the_answer() -> None:
+    """Every registration of a survey drawn 1 % too wide: the answer moves as far as 1 % claims."""
+    keyframes, links, ties, steps = survey(4)
+    config = GraphConfig(range_scale=0.01)
+    here = solve(keyframes, links, ties, config, robust=False, steps=steps)
+    drawn = []
+    for link in links:
+        ends = ((link.first, link.first_offset_m), (link.second, link.second_offset_m))
+        shift = link.shift_m.copy()
+        for (k, offset), sign in zip(ends, (1.0, -1.0), strict=True):
+            heading = keyframes.heading_rad[k]
+            starboard = np.array([np.cos(heading), -np.sin(heading)])
+            shift += sign * 0.01 * (offset @ starboard) * starboard
+        drawn.append(replace(link, shift_m=shift))
+    there = solve(keyframes, drawn, ties, config, robust=False, steps=steps)
+    moved = there.correction_m - here.correction_m
+    wider = with_range_scale(here, keyframes, links, ties, steps)
+    assert np.hypot(*moved.T).max() > 0.1
+    np.testing.assert_allclose(
+        wider.covariance_m2 - here.covariance_m2,
+        moved[:, :, None] * moved[:, None, :],
+        atol=1e-8,
+    )
