@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from perception.interpolation import cell_height
-from perception.records import ElevationStrip, FloatArray, Grid
+from perception.records import ElevationStrip, FloatArray, Grid, IntArray
 
 
 def placed_across(strip: ElevationStrip, floor: Grid | None) -> FloatArray:
@@ -24,17 +24,29 @@ def placed_across(strip: ElevationStrip, floor: Grid | None) -> FloatArray:
     poses = np.column_stack(
         [strip.easting_m, strip.northing_m, strip.heading_rad, np.nan_to_num(strip.altitude_m)]
     )
-    return _places(flat, poses, np.asarray(floor.elevation_m, float), frame)
+    knots = _knots(strip, min(floor.cell_m, floor.cell_north_m))
+    return _places(flat, poses, np.asarray(floor.elevation_m, float), frame, knots)
+
+
+def _knots(strip: ElevationStrip, cell_m: float) -> IntArray:
+    """Return the lines at which the floor is read: one a cell of it, and the last."""
+    steps = np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))
+    usual_m = max(float(np.median(steps)), 1e-3) if len(steps) else cell_m
+    last = len(strip.time_s) - 1
+    return np.unique(np.append(np.arange(0, last, max(1, int(cell_m / usual_m))), last))
 
 
 @numba.njit(cache=True, nogil=True)
 def _places(
-    flat: FloatArray, poses: FloatArray, floor: FloatArray, frame: FloatArray
+    flat: FloatArray, poses: FloatArray, floor: FloatArray, frame: FloatArray, knots: IntArray
 ) -> FloatArray:
-    """Return (n, m) places of (m,) flat ranges; `poses` (n, 4) east, north, heading, altitude."""
+    """Return (n, m) places of (m,) flat ranges; `poses` (n, 4) east, north, heading, altitude.
+
+    Between the lines `knots` places are interpolated: the floor has nothing finer than its cells to say.
+    """
     n, m = len(poses), len(flat)
     placed = np.empty((n, m), np.float32)
-    for i in range(n):
+    for i in knots:
         east, north, heading, altitude = poses[i]
         c, s = np.cos(heading), np.sin(heading)
         beneath = _height(floor, frame, east, north)
@@ -49,6 +61,12 @@ def _places(
                 squared = flat[j] ** 2 + 2.0 * altitude * rise - rise * rise
                 x = np.sign(flat[j]) * np.sqrt(max(squared, 0.0))
             placed[i, j] = x
+    for k in range(1, len(knots)):
+        low, high = knots[k - 1], knots[k]
+        for i in range(low + 1, high):
+            part = np.float32((i - low) / (high - low))
+            for j in range(m):
+                placed[i, j] = placed[low, j] + part * (placed[high, j] - placed[low, j])
     return placed
 
 
