@@ -27,6 +27,7 @@ class Patch:
     start_m, step_m : near edge of the first bin and width of a bin, slant.
     weight : looks times independent part of one cell.
     leak : level inside shadows.
+    yaw_rad : (n,) how far the beam looks ahead of square to the track, from the patch's mean.
     beam_rad : spread of the horizontal beam, two-way, 1-sigma.
     """
 
@@ -37,10 +38,11 @@ class Patch:
     step_m: float
     weight: float
     leak: float
+    yaw_rad: FloatArray
     beam_rad: float = 0.0
 
     def halved(self) -> Patch:
-        """Return the patch with bins joined in pairs; a cell of one known bin counts as that bin."""
+        """Return a quick copy: bins joined in pairs (a cell of one known bin counts as that bin), one ray a ping."""
         bins = self.ratio.shape[1] // 2
         pairs = self.ratio[:, : 2 * bins].reshape(-1, bins, 2)
         known = np.isfinite(pairs)
@@ -51,6 +53,7 @@ class Patch:
             ratio=np.ascontiguousarray(mean),
             step_m=2 * self.step_m,
             weight=2 * self.weight,
+            beam_rad=0.0,
         )
 
 
@@ -99,8 +102,9 @@ _MIDDLE_STARTS, _LAST_STARTS = 2, 2
 # A kind this far behind the other after the coarse rounds will not catch up.
 _BEHIND = 0.6
 # Profiles that end (powers of `Form`), climbed beside the best generalised Gaussian; cones are rare, by so much
-# evidence. Evidence counts a third: no family is true, and what it cannot have is taken for proof.
-_ENDED, _RARE, _TEMPER = (1.0, 2.0), 5.0, 3.0
+# evidence. Where no ray reaches a pit's floor all explain it alike: there a flat one (power 4) is among them.
+# Evidence counts a third: no family is true, and what it cannot have is taken for proof.
+_ENDED_HILLS, _ENDED_PITS, _RARE, _TEMPER = (1.0, 2.0), (1.0, 2.0, 4.0), 5.0, 3.0
 # Halving a patch of fewer bins would leave too little of it.
 _LEAST_BINS = 36
 
@@ -110,8 +114,8 @@ def fit_patch(patch: Patch, starts: Starts, favour: float = 0.0) -> BumpFit | No
 
     `favour` is what other evidence adds to the log likelihood of a hill over a crater.
     """
-    coarse = patch.halved() if patch.ratio.shape[1] >= _LEAST_BINS else patch
-    value = score(starts.sign, starts.corner, starts.parameters, *_fixed(coarse))
+    patch, value = _with_heading(patch, starts)
+    coarse = _coarse(patch)
     chosen = _leaders(starts, value)
     climbed = {
         sign: _climbed(coarse, starts.take(chosen[starts.sign[chosen] == sign]))
@@ -126,9 +130,34 @@ def fit_patch(patch: Patch, starts: Starts, favour: float = 0.0) -> BumpFit | No
     if not good:
         return None
     top = max(good, key=lambda fit: fit.gain + 0.5 * fit.sign * favour)
-    others = [_climb(patch, _recast(top, power), _LAST_ROUNDS) for power in _ENDED]
+    ended = _ENDED_HILLS if top.sign > 0 else _ENDED_PITS
+    others = [_climb(patch, _recast(top, power), _LAST_ROUNDS) for power in ended]
     same = [fit for fit in good if fit.sign == top.sign]
     return _mixed(same + [fit for fit in others if fit is not None])
+
+
+def _coarse(patch: Patch) -> Patch:
+    return patch.halved() if patch.ratio.shape[1] >= _LEAST_BINS else replace(patch, beam_rad=0.0)
+
+
+def _with_heading(patch: Patch, starts: Starts) -> tuple[Patch, FloatArray]:
+    """Return the patch, without the pings' headings where the echo is likelier so, and the starts' log posterior.
+
+    A heading that swings tells which way each ping looked, unless the compass is worse than the steering: the echo
+    itself decides.
+    """
+    variants = [patch]
+    if np.any(patch.yaw_rad):
+        variants.append(replace(patch, yaw_rad=np.zeros_like(patch.yaw_rad)))
+    best = -np.inf
+    for variant in variants:
+        coarse = _coarse(variant)
+        posterior = score(starts.sign, starts.corner, starts.parameters, *_fixed(coarse))
+        first = starts.take(np.argmax(posterior, keepdims=True))
+        gain = max((fit.gain for fit in _climbed(coarse, first)), default=-np.inf)
+        if gain > best or variant is patch:
+            best, chosen = gain, (variant, posterior)
+    return chosen
 
 
 def _recast(fit: BumpFit, power: float) -> BumpFit:
@@ -203,10 +232,8 @@ def _facet_m(patch: Patch) -> float:
 
 def _fixed(patch: Patch) -> tuple[Scene, Heard]:
     """Return what the kernels need of a patch."""
-    lines = patch.along_m
-    spacing_m = max(float(lines[-1] - lines[0]) / max(len(lines) - 1, 1), 1e-6)
-    scene = Scene(patch.drop_m, lines, patch.start_m, patch.step_m, patch.leak, _facet_m(patch),
-                  patch.beam_rad / spacing_m)  # fmt: skip
+    scene = Scene(patch.drop_m, patch.along_m, patch.start_m, patch.step_m, patch.leak, _facet_m(patch),
+                  patch.yaw_rad, patch.beam_rad)  # fmt: skip
     return scene, Heard(patch.ratio, patch.weight)
 
 

@@ -27,6 +27,7 @@ def cut_patch(
     levels: Levels,
     sample_m: float,
     track: Track,
+    side: int,
     beam_rad: float = 0.0,
 ) -> Patch:
     """Cut the echo around a shadow: one length to either side in range, half a width along."""
@@ -57,6 +58,10 @@ def cut_patch(
     # Close to nadir the nominal level says nothing: the floor's bins there are as long as an object.
     slant = (col0 + (np.arange(mean.shape[1]) + 0.5) * wide) * sample_m
     mean[slant < 1.03 * drop[:, None]] = np.nan
+    # Headings count clockwise: to starboard a turn to the right looks astern. How far the course itself lies off
+    # them (a crab angle, a compass's error) shears the picture by little and is left out.
+    heading = np.unwrap(track.heading_rad[lines]).reshape(-1, tall).mean(axis=1)
+    yaw = -side * (heading - heading.mean())
     return Patch(
         ratio=np.ascontiguousarray(mean),
         # To a micrometre: the last digit of a place must not decide where a climb ends.
@@ -66,6 +71,7 @@ def cut_patch(
         step_m=wide * sample_m,
         weight=float(np.clip(weight, 0.2, _MOST_WEIGHT)),
         leak=levels.shadow_level,
+        yaw_rad=np.round(yaw, 9),
         beam_rad=beam_rad,
     )
 

@@ -73,6 +73,7 @@ _FULL_WIDTH = 2.355
 class _Side:
     """One side of a pass: what every shadow of it is measured with."""
 
+    side: int
     marks: IntArray
     ratio: FloatArray
     levels: Levels
@@ -134,7 +135,9 @@ def find_objects(
     )
     budget = config.fits + int(config.fits_per_ping * len(ratio))
     least = sorted((shadow.cells for shadow in shadows), reverse=True)[:budget][-1:]
-    seen = _Side(marks, ratio, levels, sample_m, track, roughness, ground or roughness, config)
+    seen = _Side(
+        side, marks, ratio, levels, sample_m, track, roughness, ground or roughness, config
+    )
     rows = []
     for shadow in shadows:
         fitted = shadow.cells >= least[0]
@@ -200,7 +203,7 @@ def _fitted(shadow: Shadow, edges: _Edges, order: float, seen: _Side) -> BumpFit
     if abs(order) > _SURE_ORDER:
         starts = starts.take(np.flatnonzero(starts.sign * order > 0))
     patch = cut_patch(
-        shadow, seen.marks, seen.ratio, seen.levels, seen.sample_m, seen.track,
+        shadow, seen.marks, seen.ratio, seen.levels, seen.sample_m, seen.track, seen.side,
         float(np.deg2rad(seen.config.beam_deg)) / _FULL_WIDTH,
     )  # fmt: skip
     return fit_patch(patch, starts, favour=_ORDER_WEIGHT * order)

@@ -12,7 +12,7 @@ from perception.silhouettes import N_PARAMETERS, N_SHAPE, Form, predict
 
 # The likelihood takes no mean for darker than this. At a shadow's true level one lit sample where the family
 # of shapes has none would outweigh fifty that agree; dark enough is dark.
-LEAST_MEAN = 0.15
+LEAST_MEAN = 0.1
 # A highlight above this many times nominal is "bright" and no more.
 HIGHLIGHT_CAP = 5.0
 # Priors in logarithms: objects are about as long as wide; shapes lie between a Gaussian and a flat top.

@@ -8,7 +8,7 @@ below: each relation has its own bias. Two families of profiles over ``q = (x-x0
   a cosine's bell (about 2), power 1 a cone;
 
 A < 0 a crater. Facets along each ping's line are lit or hidden by the ray geometry and summed into slant bins
-(Lambert), relative to the flat floor; then lines are mixed as the horizontal beam mixes them.
+(Lambert), relative to the flat floor; a ping is the mean of rays across its horizontal beam, about the heading it had.
 
 The profile and the law of incidence are powers, which cost more than all the rest of a facet: each set of
 parameters tabulates them once.
@@ -30,6 +30,8 @@ N_SHAPE, N_PARAMETERS = 7, 10
 
 # Steps of the tables of profile and incidence; linear between, to 1e-5 of the height.
 _TABLE = 256
+# Rays across the horizontal beam, in its standard deviations, and their parts (Gauss-Hermite, three points).
+_RAYS, _PARTS = (-(3.0**0.5), 0.0, 3.0**0.5), (1 / 6, 2 / 3, 1 / 6)
 
 
 class Form(NamedTuple):
@@ -49,8 +51,8 @@ class Scene(NamedTuple):
 
     `drop_m`, `along_m` (n,): height of the sonar above the floor and place along the track, per ping. `start_m`,
     `step_m`: near edge of the first bin, width of a bin, slant. `leak`: level inside shadows. `facet_m`: ground
-    length of a facet. `blur`: spread of the horizontal beam (1-sigma, rad) over the pings' spacing (m); 0 looks
-    along a line.
+    length of a facet. `yaw`: (n,) how far each ping looks ahead of square to the track (rad). `beam`: spread of the
+    horizontal beam (1-sigma, rad); 0 looks along a line.
     """
 
     drop_m: FloatArray
@@ -59,7 +61,8 @@ class Scene(NamedTuple):
     step_m: float
     leak: float
     facet_m: float
-    blur: float
+    yaw: FloatArray
+    beam: float
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -74,22 +77,29 @@ def predict(parameters: FloatArray, form: Form, scene: Scene, out: FloatArray) -
     rho_end = 12.4 ** (0.5 / beta) if form.power == 0.0 else 1.0
     height = form.sign * np.exp(parameters[2])
     profile, law = _tables(height, beta, form.power, np.exp(parameters[6]), rho_end)
+    ray = np.empty(out.shape[1])
+    rays = len(_RAYS) if scene.beam > 0.0 else 1
     for i in range(out.shape[0]):
         out[i, :] = 0.0
-        dy = abs(scene.along_m[i] - y0) / sy
-        x_low = x_high = 0.0
-        if dy < rho_end:
-            half = sx * (rho_end**form.corner - dy**form.corner) ** (1.0 / form.corner)
-            x_low, x_high = max(x0 - half, 0.02 * scene.drop_m[i]), x0 + half
-        if x_high <= x_low:
-            out[i, :] = 1.0 + scene.leak
-            continue
-        resume = _trace(
-            out[i], x_low, x_high, dy, x0, sx, form.corner, profile, rho_end, law,
-            scene.drop_m[i], scene.start_m, scene.step_m, scene.facet_m,
-        )  # fmt: skip
-        _add_floor(out[i], x_low, resume, law, scene.drop_m[i], scene)
-    _spread(out, scene.blur, scene.start_m, scene.step_m)
+        for j in range(rays):
+            part, bearing = 1.0, scene.yaw[i]
+            if rays > 1:
+                part, bearing = _PARTS[j], bearing + _RAYS[j] * scene.beam
+            dy = abs(scene.along_m[i] + x0 * bearing - y0) / sy
+            x_low = x_high = 0.0
+            if dy < rho_end:
+                half = sx * (rho_end**form.corner - dy**form.corner) ** (1.0 / form.corner)
+                x_low, x_high = max(x0 - half, 0.02 * scene.drop_m[i]), x0 + half
+            if x_high <= x_low:
+                out[i, :] += part * (1.0 + scene.leak)
+                continue
+            ray[:] = 0.0
+            resume = _trace(
+                ray, x_low, x_high, dy, x0, sx, form.corner, profile, rho_end, law,
+                scene.drop_m[i], scene.start_m, scene.step_m, scene.facet_m,
+            )  # fmt: skip
+            _add_floor(ray, x_low, resume, law, scene.drop_m[i], scene)
+            out[i, :] += part * ray
     return out
 
 
@@ -107,28 +117,6 @@ def _add_floor(row, x_low, resume, law, drop, scene):  # type: ignore[no-untyped
             # Flat floor: cos^kappa of the incidence times the ground length of a bin.
             row[k] /= _at(law, drop / ray * _TABLE) * step_m * ray / ground
         row[k] += min(floor / step_m, 1.0) + scene.leak
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _spread(out, blur, start_m, step_m):  # type: ignore[no-untyped-def]
-    """Mix the lines of `out` as the horizontal beam does, in place: its footprint widens with range.
-
-    Steps of diffusion whose variances add up to the beam's, so that no footprint is too wide or too narrow.
-    """
-    n, m = out.shape
-    widest = (blur * (start_m + m * step_m)) ** 2
-    if n < 2 or widest < 1e-3:
-        return
-    steps = min(int(widest / 0.5) + 1, 16)
-    for _ in range(steps):
-        for k in range(m):
-            side = min((blur * (start_m + (k + 0.5) * step_m)) ** 2 / (2.0 * steps), 0.25)
-            before = out[0, k]
-            for i in range(n):
-                here = out[i, k]
-                after = out[i + 1, k] if i + 1 < n else here
-                out[i, k] = here + side * (before - 2.0 * here + after)
-                before = here
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

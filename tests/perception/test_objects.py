@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from perception.fitting import Patch, Starts, fit_patch
 from perception.objects import ObjectTable, write_objects_csv
 from perception.silhouette_likelihood import HIGHLIGHT_CAP
 from perception.silhouettes import Form, Scene, predict
@@ -121,7 +122,7 @@ def test_the_model_of_the_fit_agrees_with_independent_facets() -> None:
     parameters = np.array([15, 0, np.log(1.5), np.log(1.2), np.log(1.2), 0.0, np.log(2.0)])
     model = predict(
         parameters, Form(1.0, 2.0, 0.0),
-        Scene(np.array([10.0]), np.array([0.0]), 0.0, 0.06, 0.0, 0.03, 0.0), np.zeros((1, 600)),
+        Scene(np.array([10.0]), np.array([0.0]), 0.0, 0.06, 0.0, 0.03, np.zeros(1), 0.0), np.zeros((1, 600)),
     )[0]  # fmt: skip
     far = slice(200, 550)
     smooth = np.convolve(reference[far], np.ones(5) / 5, mode="same")
@@ -130,6 +131,35 @@ def test_the_model_of_the_fit_agrees_with_independent_facets() -> None:
     assert np.mean(np.abs(difference)) < 0.03
     # Shadow's length to two samples.
     assert abs(int((smooth < 0.2).sum()) - int((model5 < 0.2).sum())) <= 2
+
+
+def _swinging(looked_rad: np.ndarray, told_rad: np.ndarray, rng: np.random.Generator) -> Patch:
+    """A half sphere of 1.2 m, 30 m off, by pings 0.45 m apart that look where `looked_rad` says."""
+    along = 0.45 * np.arange(24)
+    shape = np.array([30.0, 5.0, np.log(1.2), np.log(1.1), np.log(1.1), np.log(0.5), np.log(2.0)])
+    scene = Scene(np.full(24, 12.0), along, 29.0, 0.06, 0.02, 0.04, looked_rad, 0.004)
+    echo = predict(shape, Form(1.0, 2.0, 2.0), scene, np.zeros((24, 110)))
+    return Patch(echo * rng.exponential(size=echo.shape), along, scene.drop_m, 29.0, 0.06, 1.0, 0.02,
+                 told_rad, 0.004)  # fmt: skip
+
+
+def test_headings_that_swing_place_the_pings_and_a_bad_compass_is_not_believed() -> None:
+    """A boat yaws by half a degree: 0.3 m at 30 m. Told, it helps; where it is noise, the echo says so."""
+    rng = np.random.default_rng(8)
+    parameters = np.array([
+        [30.0 + 0.3 * size, 5.0 + beside, 0.1, np.log(size), np.log(size), np.log(beta), np.log(1.9), 0, 0, 0]
+        for size in (0.4, 0.7, 1.0) for beside in (-0.3, 0.3) for beta in (1.0, 2.0, 5.0)
+    ])  # fmt: skip
+    starts = Starts(np.ones(len(parameters)), np.full(len(parameters), 2.0), parameters)
+    errors: dict[str, list[float]] = {"told": [], "bad compass": []}
+    for _ in range(4):
+        yaw, none = rng.normal(0, np.deg2rad(0.5), 24), np.zeros(24)
+        for case, looked, told in (("told", yaw, yaw), ("bad compass", none, yaw)):
+            fit = fit_patch(_swinging(looked, told, rng), starts)
+            assert fit is not None
+            errors[case].append(fit.height_m / 1.2 - 1)
+    for case, error in errors.items():
+        assert np.median(np.abs(error)) < 0.1, case
 
 
 def test_objects_csv_has_the_columns_of_the_contract(tmp_path: Path) -> None:
