@@ -146,7 +146,9 @@ class OpenMap:
             with rasterio.open(self.sigma_beside) as beside:
                 sigma = _read_band(beside, 1, window) * self.unit_m
         if sigma is not None and (sigma < 0).any():
-            self._tell_once("sigma", f"holds negative sigmas ({np.nanmin(sigma):g}): taken for unknown")
+            self._tell_once(
+                "sigma", f"holds negative sigmas ({np.nanmin(sigma):g}): taken for unknown"
+            )
             sigma = np.where(sigma < 0, np.nan, sigma)
         square = np.isclose(transform.a, -transform.e, rtol=1e-9)
         return Grid(
