@@ -4,17 +4,22 @@ Beam pattern, the floor's angular law, a wrong time-varying gain and a slowly va
 told apart from one pass, and need not be: their product is estimated from the data as robust
 medians of log power, one factor after another (backfitting): per angle of incidence, per angle in
 the rolled frame, per slant range, along the track, and a slow remainder in two dimensions.
+
+Medians are of samples of the whole pass; arrays of the pass's size there are two, the power and the ratio made of
+it: all between is worked out for a hundred pings at a time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, median_filter
 from scipy.special import gammaincinv, polygamma
 
-from perception.records import FloatArray, IntArray
+from perception.records import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,19 +51,19 @@ class Equalised:
     ----------
     ratio : (n, m) float32 power over nominal power, mean 1 on a nominal floor; NaN in the water
         column and where there is no data.
-    log_nominal : (n, m) float32 natural log of the nominal mean power.
     looks : effective number of looks of the speckle, from the spread of nominal samples.
-    expansion : power to which the recorder's levels were raised, 1 for a linear recorder (`expansion`).
+    expansion : power to which the recorder's levels were raised, 1 for a linear recorder.
     """
 
     ratio: FloatArray
-    log_nominal: FloatArray
     looks: float
     expansion: float = 1.0
 
 
 # Medians come from at most this many samples a side: 1e5 hold a bin's median to 1 % at one look.
 _SUBSAMPLE = 250_000
+# The spread of the residual, from as many samples; a least and a usual power from more.
+_SPREAD_SAMPLE, _POWER_SAMPLE = 200_000, 1_000_000
 
 
 def equalise(
@@ -85,26 +90,68 @@ def equalise(
     """
     config = config or GainConfig()
     n, m = power.shape
-    range_m = (np.arange(m, dtype=np.float32) + 0.5) * np.float32(sample_m)
-    first_sample = np.floor(first_return_m / sample_m)
-    floor = (np.arange(m) >= first_sample[:, None]) & np.isfinite(power)
-    if not floor.any():
-        empty = np.full((n, m), np.nan, np.float32)
-        return Equalised(empty, empty.copy(), 1.0)
-    log_power = _log_power(power, floor)
-    spread = incidence_coordinate(range_m, altitude_m)
-    log_nominal = _factors(log_power, spread, floor, roll_rad, config)
-    residual = log_power - log_nominal
-    log_nominal += _slow_remainder(residual, floor, config)
-    residual = np.where(floor, log_power - log_nominal, np.nan)
-    power_law = expansion(log_power, np.asarray(first_sample, float), effective_looks(residual))
-    residual *= np.float32(power_law)
-    looks = effective_looks(residual)
+    echo = _Echo(power, sample_m, np.floor(first_return_m / sample_m), altitude_m, roll_rad)
+    tall = max(1, round(n / config.albedo_pings))
+    edges = np.linspace(0, n, tall + 1).astype(int)
+    stretches = [slice(a, b) for a, b in pairwise(edges)]
+    lit = np.concatenate([echo.floor(rows).sum(axis=1) for rows in stretches])
+    ratio = np.full((n, m), np.nan, np.float32)
+    if not lit.any():
+        return Equalised(ratio, 1.0)
+    echo = replace(echo, least=_least_power(echo, stretches))
+    factors = _Factors.of(echo, lit, stretches, config)
+    slow = _slow_remainder(echo, factors, ratio, stretches, config)
+    found = _residual(echo, slow, ratio, stretches)
+    spread = effective_looks(found.sample)
+    power_law = _power_law(found.near, found.water, spread)
+    looks = effective_looks(found.sample * np.float32(power_law))
     # The medians above are of log power; the nominal is the mean of power.
     median_of_mean = float(gammaincinv(looks, 0.5)) / looks
-    ratio = (np.exp(residual) * np.float32(median_of_mean)).astype(np.float32)
-    log_nominal -= np.float32(np.log(median_of_mean) / power_law)
-    return Equalised(ratio, log_nominal.astype(np.float32), looks, power_law)
+    for rows in stretches:
+        part = ratio[rows]
+        part *= np.float32(power_law)
+        np.exp(part, out=part)
+        part *= np.float32(median_of_mean)
+    return Equalised(ratio, looks, power_law)
+
+
+@dataclass(frozen=True, slots=True)
+class _Echo:
+    """One side of a pass, from which stretches of pings are worked out.
+
+    Attributes
+    ----------
+    power : (n, m). first_sample, altitude_m, roll_rad : (n,).
+    least : power to which less is lifted before the logarithm.
+    """
+
+    power: FloatArray
+    sample_m: float
+    first_sample: FloatArray
+    altitude_m: FloatArray
+    roll_rad: FloatArray
+    least: float = 1.0
+
+    def floor(self, rows: slice) -> BoolArray:
+        """Return which samples are floor and not water."""
+        power = self.power[rows]
+        after: BoolArray = np.arange(power.shape[1]) >= self.first_sample[rows, None]
+        return after & np.isfinite(power)
+
+    def log_power(self, rows: slice) -> FloatArray:
+        return self.log_of(self.power[rows])
+
+    def log_of(self, power: FloatArray) -> FloatArray:
+        return np.log(np.maximum(np.nan_to_num(power), self.least)).astype(np.float32)
+
+    @property
+    def range_m(self) -> FloatArray:
+        m = self.power.shape[1]
+        return (np.arange(m, dtype=np.float32) + 0.5) * np.float32(self.sample_m)
+
+    def spread(self, rows: slice) -> FloatArray:
+        """Return the pings' incidence coordinate."""
+        return incidence_coordinate(self.range_m, self.altitude_m[rows])
 
 
 # Water below a linear recorder's floor by this much at least; one look of speckle spreads log power by 1.28.
@@ -113,7 +160,16 @@ _ONE_LOOK_SPREAD = 1.28
 _MOST_EXPANSION = 5.0
 
 
-def expansion(log_power: FloatArray, first_sample: FloatArray, looks: float) -> float:
+def _beside_the_edge(
+    log_power: FloatArray, first_sample: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the levels of near floor and of water, from a little beside the first return."""
+    place = np.arange(log_power.shape[1]) / np.maximum(first_sample, 1.0)[:, None]
+    # Between the transmit pulse and the floor; from a little behind the edge to half as far again.
+    return log_power[(place > 1.1) & (place < 1.5)], log_power[(place > 0.4) & (place < 0.9)]
+
+
+def _power_law(near: FloatArray, water: FloatArray, looks: float) -> float:
     """Return the power that undoes a recorder's compression of levels, at least 1.
 
     Recorders for display store something like the logarithm of the echo in 8 bits: water column and
@@ -123,15 +179,8 @@ def expansion(log_power: FloatArray, first_sample: FloatArray, looks: float) -> 
 
     Parameters
     ----------
-    log_power : (n, m) natural log of recorded power.
-    first_sample : (n,) sample of the first return.
-    looks : effective looks of the recorded levels.
+    near, water : log power of near floor and of the water column; `looks` those of the recorded levels.
     """
-    m = log_power.shape[1]
-    place = np.arange(m) / np.maximum(first_sample, 1.0)[:, None]
-    # Between the transmit pulse and the floor; from a little behind the edge to half as far again.
-    water = log_power[(place > 0.4) & (place < 0.9)]
-    near = log_power[(place > 1.1) & (place < 1.5)]
     if len(water) < 100 or len(near) < 100:
         return 1.0
     contrast = float(np.median(near) - np.median(water))
@@ -157,7 +206,7 @@ def effective_looks(log_residual: FloatArray) -> float:
 
     By the interquartile range, which shadows and highlights hardly touch.
     """
-    values = log_residual.ravel()[:: max(1, log_residual.size // 200_000)]
+    values = log_residual.ravel()[:: max(1, log_residual.size // _SPREAD_SAMPLE)]
     values = values[np.isfinite(values)]
     if len(values) < 50:
         return 1.0
@@ -167,49 +216,71 @@ def effective_looks(log_residual: FloatArray) -> float:
     return float(np.interp(-(high - low), -width, grid))
 
 
-def _log_power(power: FloatArray, floor: FloatArray) -> FloatArray:
-    """Return log power, stored zeros lifted to a quarter of the least positive power."""
-    values = power[floor]
-    positive = values[values > 0]
-    least = float(positive.min()) if len(positive) else 1.0
-    typical = float(np.median(positive)) if len(positive) else 1.0
-    return np.log(np.maximum(np.nan_to_num(power), max(0.25 * least, 1e-7 * typical))).astype(
-        np.float32
-    )
+def _least_power(echo: _Echo, stretches: Sequence[slice]) -> float:
+    """Return a quarter of the floor's least positive power, to which stored zeros are lifted."""
+    least, sample = np.inf, []
+    stride = max(1, echo.power.size // _POWER_SAMPLE)
+    for rows in stretches:
+        values = echo.power[rows][echo.floor(rows)]
+        positive = values[values > 0]
+        if len(positive):
+            least = min(least, float(positive.min()))
+            sample.append(positive[::stride])
+    if not sample:
+        return 0.25
+    return max(0.25 * least, 1e-7 * float(np.median(np.concatenate(sample))))
 
 
-def _factors(
-    log_power: FloatArray,
-    spread: FloatArray,
-    floor: FloatArray,
-    roll_rad: FloatArray,
-    config: GainConfig,
-) -> FloatArray:
-    """Return the sum of the one-dimensional factors, (n, m), by robust backfitting."""
-    n, m = log_power.shape
-    rows, columns = _subsample(floor)
-    data = log_power[rows, columns]
-    terms = [_Term(_bins_of(spread[rows, columns], config.angle_bins, float(spread.max())))]
-    if float(np.std(roll_rad)) > np.deg2rad(0.7):
-        rolled = np.arctan(np.sinh(spread[rows, columns])) + roll_rad[rows]
-        terms.append(_Term(_bins_of(rolled, config.angle_bins, np.pi / 2)))
-    # At a constant altitude angle and range are one and the same: a second factor would be noise.
-    nadir = np.argmax(spread > 0, axis=1)
-    varied = float(np.std(nadir)) > 0.05 * max(float(np.mean(nadir)), 1.0)
-    if varied:
-        terms.append(_Term(_bins_of(columns / m, config.range_bins, 1.0)))
-    rest = data.copy()
-    for _ in range(2 if len(terms) > 1 else 1):
-        for term in terms:
-            rest += term.at_data()
-            term.fit(rest)
-            rest -= term.at_data()
-    total = terms[0].over(spread / max(float(spread.max()), 1e-9))
-    if float(np.std(roll_rad)) > np.deg2rad(0.7):
-        total += terms[1].over((np.arctan(np.sinh(spread)) + roll_rad[:, None]) / (np.pi / 2))
-    if varied:
-        total += terms[-1].over(np.broadcast_to(((np.arange(m) + 0.5) / m)[None, :], (n, m)))
-    return total + _along(rest, rows, n, config.along_pings)[:, None].astype(np.float32)
+@dataclass(frozen=True, slots=True)
+class _Factors:
+    """The one-dimensional factors of the gain: over angle of incidence, and where they vary over rolled angle and range.
+
+    `top` is the greatest incidence coordinate of the pass, `along` (n,) the factor along the track.
+    """
+
+    terms: list[_Term]
+    rolls: bool
+    varied: bool
+    top: float
+    along: FloatArray
+
+    @classmethod
+    def of(
+        cls, echo: _Echo, lit: IntArray, stretches: Sequence[slice], config: GainConfig
+    ) -> _Factors:
+        """Fit the factors by robust backfitting to an even subset of the floor's samples; `lit` (n,) their number."""
+        n, m = echo.power.shape
+        rows, columns, data, spread = _subset(echo, int(lit.sum()), stretches)
+        top = float(incidence_coordinate(echo.range_m[-1:], echo.altitude_m).max())
+        terms = [_Term(_bins_of(spread, config.angle_bins, top))]
+        rolls = float(np.std(echo.roll_rad)) > np.deg2rad(0.7)
+        if rolls:
+            rolled = np.arctan(np.sinh(spread)) + echo.roll_rad[rows]
+            terms.append(_Term(_bins_of(rolled, config.angle_bins, np.pi / 2)))
+        # At a constant altitude angle and range are one and the same: a second factor would be noise.
+        nadir = np.searchsorted(echo.range_m, echo.altitude_m, side="right") % m
+        varied = float(np.std(nadir)) > 0.05 * max(float(np.mean(nadir)), 1.0)
+        if varied:
+            terms.append(_Term(_bins_of(columns / m, config.range_bins, 1.0)))
+        rest = data.copy()
+        for _ in range(2 if len(terms) > 1 else 1):
+            for term in terms:
+                rest += term.at_data()
+                term.fit(rest)
+                rest -= term.at_data()
+        return cls(terms, rolls, varied, top, _along(rest, rows, n, config.along_pings))
+
+    def over(self, echo: _Echo, rows: slice) -> FloatArray:
+        """Return the factors' sum over a stretch of pings."""
+        spread = echo.spread(rows)
+        total = self.terms[0].over(spread / max(self.top, 1e-9))
+        if self.rolls:
+            rolled = np.arctan(np.sinh(spread)) + echo.roll_rad[rows, None]
+            total += self.terms[1].over(rolled / (np.pi / 2))
+        if self.varied:
+            m = spread.shape[1]
+            total += self.terms[-1].over((np.arange(m) + 0.5) / m)
+        return total + self.along[rows, None].astype(np.float32)
 
 
 class _Term:
@@ -246,14 +317,22 @@ def _bins_of(values: FloatArray, count: int, top: float) -> tuple[IntArray, int]
     return np.clip(index, 0, count - 1), count
 
 
-def _subsample(floor: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of an even subset of the floor's samples."""
-    flat = np.flatnonzero(floor)
+def _subset(
+    echo: _Echo, count: int, stretches: Sequence[slice]
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Return row, column, log power and incidence coordinate of an even subset of the floor's `count` samples."""
     # A stride coprime to the width would visit all columns; an odd one is near enough.
-    stride = max(1, len(flat) // _SUBSAMPLE) | 1
-    flat = flat[::stride]
-    rows, columns = np.divmod(flat, floor.shape[1])
-    return rows, columns
+    stride = max(1, count // _SUBSAMPLE) | 1
+    m, passed = echo.power.shape[1], 0
+    parts = []
+    for rows in stretches:
+        flat = np.flatnonzero(echo.floor(rows))
+        parts.append(flat[-passed % stride :: stride] + rows.start * m)
+        passed += len(flat)
+    row, column = np.divmod(np.concatenate(parts), m)
+    ratio = echo.range_m[column] / np.maximum(echo.altitude_m[row], 1e-3)
+    spread = np.arccosh(np.maximum(ratio, 1.0)).astype(np.float32)
+    return row, column, echo.log_of(echo.power[row, column]), spread
 
 
 def _along(rest: FloatArray, rows: IntArray, n: int, window: int) -> FloatArray:
@@ -271,23 +350,48 @@ def _along(rest: FloatArray, rows: IntArray, n: int, window: int) -> FloatArray:
     return gaussian_filter1d(calm, window / 8, mode="nearest")
 
 
-def _slow_remainder(residual: FloatArray, floor: FloatArray, config: GainConfig) -> FloatArray:
-    """Return the slowly varying remainder (n, m): medians of large blocks, interpolated between."""
-    n, m = residual.shape
-    tall = max(1, round(n / config.albedo_pings))
+def _slow_remainder(
+    echo: _Echo,
+    factors: _Factors,
+    log_nominal: FloatArray,
+    stretches: Sequence[slice],
+    config: GainConfig,
+) -> FloatArray:
+    """Write what the factors make nominal to `log_nominal` (n, m); return what they leave, medians of large blocks.
+
+    One row of blocks a stretch, `albedo_parts` across.
+    """
+    m = echo.power.shape[1]
     wide = config.albedo_parts
-    row_edges = np.linspace(0, n, tall + 1).astype(int)
     column_edges = np.linspace(0, m, wide + 1).astype(int)
-    blocks = np.zeros((tall, wide))
-    for i in range(tall):
-        for j in range(wide):
-            cell = np.s_[row_edges[i] : row_edges[i + 1], column_edges[j] : column_edges[j + 1]]
-            values = residual[cell][floor[cell]]
+    blocks = np.zeros((len(stretches), wide))
+    for i, rows in enumerate(stretches):
+        log_nominal[rows] = factors.over(echo, rows)
+        residual, floor = echo.log_power(rows) - log_nominal[rows], echo.floor(rows)
+        for j, (first, last) in enumerate(pairwise(column_edges)):
+            values = residual[:, first:last][floor[:, first:last]]
             if len(values) > 50:
                 step = max(1, len(values) // 5000)
                 blocks[i, j] = np.median(values[::step])
     limit = config.albedo_limit_db * np.log(10) / 10
-    blocks = np.clip(blocks, -limit, limit)
+    return np.clip(blocks, -limit, limit)
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What `_residual` saw: an even sample of the residual; levels of near floor and of water."""
+
+    sample: FloatArray
+    near: FloatArray
+    water: FloatArray
+
+
+def _residual(
+    echo: _Echo, blocks: FloatArray, log_nominal: FloatArray, stretches: Sequence[slice]
+) -> _Found:
+    """Turn `log_nominal` (n, m) into log power less it and the slow remainder, NaN where not floor, in place."""
+    n, m = log_nominal.shape
+    tall, wide = blocks.shape
     row = np.clip((np.arange(n) + 0.5) / n * tall - 0.5, 0, tall - 1)
     column = np.clip((np.arange(m) + 0.5) / m * wide - 0.5, 0, wide - 1)
     along = np.array([np.interp(row, np.arange(tall), blocks[:, j]) for j in range(wide)])
@@ -295,4 +399,14 @@ def _slow_remainder(residual: FloatArray, floor: FloatArray, config: GainConfig)
     f = (column - low)[None, :].astype(np.float32)
     along32 = along.T.astype(np.float32)
     high = np.minimum(low + 1, wide - 1)
-    return (1 - f) * along32[:, low] + f * along32[:, high]
+    stride = max(1, n * m // _SPREAD_SAMPLE)
+    sample, near, water = [], [], []
+    for rows in stretches:
+        log_power, part = echo.log_power(rows), log_nominal[rows]
+        part += (1 - f) * along32[rows][:, low] + f * along32[rows][:, high]
+        part[:] = np.where(echo.floor(rows), log_power - part, np.nan)
+        sample.append(part.ravel()[-rows.start * m % stride :: stride])
+        beside = _beside_the_edge(log_power, np.asarray(echo.first_sample[rows], float))
+        near.append(beside[0])
+        water.append(beside[1])
+    return _Found(*(np.concatenate(values) for values in (sample, near, water)))

@@ -4,6 +4,9 @@ One look of speckle makes single samples meaningless (a tenth of a nominal floor
 label of a sample is the least cost over its neighbourhood: minus log likelihoods of Gamma speckle
 around each level, plus a price for every change of label, summed along eight directions through the
 image by dynamic programming (the aggregation of semi-global matching, Hirschmueller 2008).
+
+Costs are held for a stretch of pings at a time. Paths run on from one stretch to the next: those that go backwards
+are sent ahead once, and what they bring is kept at the stretches' ends. Labels are those of the whole image at once.
 """
 
 from __future__ import annotations
@@ -78,11 +81,38 @@ def segment_levels(ratio: FloatArray, looks: float, config: LevelConfig | None =
         [shadow_top, 10 ** (-config.nominal_db / 10), 10 ** (config.nominal_db / 10),
          10 ** (config.highlight_db / 10)], np.float32,
     )  # fmt: skip
-    cost = _unary(ratio, bounds, weight)
-    label = _decide(_aggregate(cost, np.float32(config.change_cost)), ratio)
+    label = _label(ratio, bounds, weight, np.float32(config.change_cost))
     dark = ratio[label == SHADOW]
     level = float(np.clip(dark.mean(), 1e-3, shadow_top)) if len(dark) > 100 else 0.05
     return Levels(label, level, looks, independent)
+
+
+# Samples whose costs are held at once: 24 bytes each.
+_STRETCH = 2_000_000
+
+
+def _label(
+    ratio: FloatArray, bounds: FloatArray, weight: np.float32, change_cost: np.float32
+) -> IntArray:
+    """Return the label (n, m) of least cost over eight directions."""
+    n, m = ratio.shape
+    count = max(1, -(-n * m // _STRETCH))
+    stretches = [slice(n * k // count, n * (k + 1) // count) for k in range(count)]
+    # What the backward paths bring to a stretch's last ping, and the forward ones to its first.
+    behind = [np.zeros((4, m, 3), np.float32) for _ in stretches]
+    for k in range(count - 1, 0, -1):
+        cost = _unary(ratio[stretches[k]], bounds, weight)
+        behind[k - 1][:] = behind[k]
+        _sweep(cost, change_cost, -1, behind[k - 1], np.empty((0, m, 3), np.float32))
+    ahead = np.zeros((4, m, 3), np.float32)
+    label = np.empty((n, m), np.int8)
+    for rows, back in zip(stretches, behind, strict=True):
+        cost = _unary(ratio[rows], bounds, weight)
+        total = np.zeros_like(cost)
+        _sweep(cost, change_cost, 1, ahead, total)
+        _sweep(cost, change_cost, -1, back, total)
+        label[rows] = _decide(total, ratio[rows])
+    return label
 
 
 def independent_part(ratio: FloatArray) -> float:
@@ -144,42 +174,36 @@ def _unary(ratio, bounds, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _aggregate(cost, change_cost):  # type: ignore[no-untyped-def]
-    """Sum the least path costs (n, m, 3) arriving at every sample from eight directions.
+def _sweep(cost, change_cost, step, previous, total):  # type: ignore[no-untyped-def]
+    """Add the least path costs arriving at every sample (n, m, 3) from four directions to `total`, if it has room.
 
-    Two sweeps over the image, each carrying four directions, so that memory stays at two rows.
+    The sweep runs forward (`step` 1) or backward (-1); a second one the other way makes eight directions.
+    `previous` (4, m, 3) is what paths bring along from the ping before the first, and then from the last.
     """
     n, m, classes = cost.shape
-    total = np.zeros((n, m, classes), dtype=np.float32)
-    previous = np.zeros((4, m, classes), dtype=np.float32)
+    adds = len(total) > 0
     current = np.zeros((4, m, classes), dtype=np.float32)
-    for sweep in range(2):
-        step = 1 if sweep == 0 else -1
-        previous[:] = 0
-        for ii in range(n):
-            i = ii if sweep == 0 else n - 1 - ii
-            for kk in range(m):
-                k = kk if sweep == 0 else m - 1 - kk
-                for d in range(4):
-                    # Arrive from: the sample before, the ping before, and its two diagonals.
-                    at = (
-                        k - step
-                        if d == 0
-                        else (k if d == 1 else (k - step if d == 2 else k + step))
-                    )
-                    if at < 0 or at >= m:
-                        for c in range(classes):
-                            current[d, k, c] = cost[i, k, c]
-                            total[i, k, c] += cost[i, k, c]
-                        continue
-                    row = current if d == 0 else previous
-                    least = min(row[d, at, 0], min(row[d, at, 1], row[d, at, 2]))
+    for ii in range(n):
+        i = ii if step == 1 else n - 1 - ii
+        for kk in range(m):
+            k = kk if step == 1 else m - 1 - kk
+            for d in range(4):
+                # Arrive from: the sample before, the ping before, and its two diagonals.
+                at = k - step if d == 0 else (k if d == 1 else (k - step if d == 2 else k + step))
+                if at < 0 or at >= m:
                     for c in range(classes):
-                        value = cost[i, k, c] + min(row[d, at, c], least + change_cost) - least
-                        current[d, k, c] = value
+                        current[d, k, c] = cost[i, k, c]
+                        if adds:
+                            total[i, k, c] += cost[i, k, c]
+                    continue
+                row = current if d == 0 else previous
+                least = min(row[d, at, 0], min(row[d, at, 1], row[d, at, 2]))
+                for c in range(classes):
+                    value = cost[i, k, c] + min(row[d, at, c], least + change_cost) - least
+                    current[d, k, c] = value
+                    if adds:
                         total[i, k, c] += value
-            previous, current = current, previous
-    return total
+        previous[:] = current
 
 
 @njit(cache=True, nogil=True)

@@ -21,7 +21,7 @@ class PassConfig:
     """Limits of the splitting.
 
     `most_samples` bounds the memory of one pass (both sides together): a longer line is cut in equal
-    parts, so that memory does not grow with the file.
+    parts, so that memory does not grow with the file. 5,900 pings of 2 x 1024 samples, at some 40 bytes each.
     """
 
     gap_s: float = 5.0
@@ -36,7 +36,7 @@ class PassConfig:
     stop_s: float = 10.0
     least_pings: int = 20
     fewest_pings: int = 10
-    most_samples: float = 6e7
+    most_samples: float = 1.2e7
 
 
 @dataclass(frozen=True, slots=True)

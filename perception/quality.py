@@ -31,6 +31,8 @@ _SURFACE_STANDS = 1.3
 # Beams of neighbouring pings cross inside the swath where the turn is tighter than the range; half of that
 # already doubles the far pings' spacing.
 _TURN = 0.5
+# Pings worked on at once.
+_PINGS = 512
 
 
 def saturated_samples(amplitude: FloatArray) -> BoolArray:
@@ -67,16 +69,19 @@ def surface_samples(
     """
     n, m = ratio.shape
     out = np.zeros((n, m), bool)
-    at = depth_m / sample_m
-    half = np.maximum(2.0, 0.01 * at)
-    k = np.arange(m) + 0.5
-    off = np.abs(k - at[:, None])
-    near = (off <= half[:, None]) & (depth_m > altitude_m)[:, None] & np.isfinite(ratio)
-    beside = (off > 2 * half[:, None]) & (off < 6 * half[:, None]) & np.isfinite(ratio)
-    if near.sum() < 50 or beside.sum() < 50:
-        return out
-    if np.median(ratio[near]) > _SURFACE_STANDS * np.median(ratio[beside]):
-        out = near
+    levels: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    for first in range(0, n, _PINGS):
+        rows = slice(first, first + _PINGS)
+        at = depth_m[rows] / sample_m
+        half = np.maximum(2.0, 0.01 * at)[:, None]
+        off = np.abs(np.arange(m) + 0.5 - at[:, None])
+        heard = np.isfinite(ratio[rows])
+        out[rows] = (off <= half) & (depth_m[rows] > altitude_m[rows])[:, None] & heard
+        levels[0].append(ratio[rows][out[rows]])
+        levels[1].append(ratio[rows][(off > 2 * half) & (off < 6 * half) & heard])
+    on, beside = (np.concatenate(part) for part in levels)
+    if len(on) < 50 or len(beside) < 50 or np.median(on) <= _SURFACE_STANDS * np.median(beside):
+        out[:] = False
     return out
 
 

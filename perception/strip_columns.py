@@ -7,7 +7,7 @@ import numpy as np
 from perception.gain import Equalised
 from perception.levels import SHADOW, Levels
 from perception.object_table import ObjectRow
-from perception.records import FloatArray
+from perception.records import BoolArray, FloatArray, IntArray
 
 
 def columns_across(
@@ -28,6 +28,15 @@ def columns_across(
     return (np.arange(-left, right) + 0.5) * cell
 
 
+# Lines worked on at once: tens of megabytes for a thousand columns.
+_LINES = 512
+
+
+def stretches(lines: int) -> list[slice]:
+    """Return the lines of a strip in stretches to be worked on one after the other."""
+    return [slice(first, min(first + _LINES, lines)) for first in range(0, lines, _LINES)]
+
+
 def lay_on_columns(
     sides: list[tuple[Equalised, Levels]],
     across: FloatArray,
@@ -43,33 +52,45 @@ def lay_on_columns(
         if not columns.any():
             continue
         x = np.abs(across[columns])
-        # Mean echo over a column's samples, by running sums: speckle falls and no sample is dropped.
-        known = np.isfinite(equalised.ratio)
-        sums = np.concatenate(
-            [np.zeros((n, 1)), np.cumsum(np.where(known, equalised.ratio, 0), axis=1, dtype=float)],
-            axis=1,
-        )
-        counts = np.concatenate(
-            [np.zeros((n, 1), np.int32), np.cumsum(known, axis=1, dtype=np.int32)], axis=1
-        )
-        width = equalised.ratio.shape[1]
-        inner = np.hypot(np.maximum(x - cell / 2, 0), altitude_m[:, None]) / sample_m
-        outer = np.hypot(x + cell / 2, altitude_m[:, None]) / sample_m
-        low = np.clip(np.floor(inner), 0, width - 1).astype(np.int32)
-        high = np.clip(np.maximum(np.ceil(outer), low + 1), 1, width).astype(np.int32)
-        number = np.take_along_axis(counts, high, 1) - np.take_along_axis(counts, low, 1)
-        total = np.take_along_axis(sums, high, 1) - np.take_along_axis(sums, low, 1)
-        inside = (number > 0) & (outer <= width + 1)
-        echo[:, columns] = np.where(inside, total / np.maximum(number, 1), np.nan)
-        middle = np.clip(
-            (np.hypot(x, altitude_m[:, None]) / sample_m).astype(np.int32), 0, width - 1
-        )
-        label = np.take_along_axis(levels.label, middle, 1)
-        shadow[:, columns] = inside & (label == SHADOW)
-        # Ground before the first echo (on a slope, or beside nadir) is floor all the same; ground past the last
-        # sample of its ping is not.
-        last = np.where(known.any(axis=1), width - known[:, ::-1].argmax(axis=1), 0)
-        seen[:, columns] = outer <= last[:, None] + 1
+        for rows in stretches(n):
+            echo[rows, columns], shadow[rows, columns], seen[rows, columns] = _lay_lines(
+                equalised.ratio[rows], levels.label[rows], x, cell, altitude_m[rows], sample_m
+            )
+    return echo, shadow, seen
+
+
+def _lay_lines(
+    ratio: FloatArray,
+    label: IntArray,
+    x: FloatArray,
+    cell: float,
+    altitude_m: FloatArray,
+    sample_m: float,
+) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Return one side's echo (n, k), shadow and seen on columns at ground range `x` (k,)."""
+    n, width = ratio.shape
+    # Mean echo over a column's samples, by running sums: speckle falls and no sample is dropped.
+    known = np.isfinite(ratio)
+    sums = np.concatenate(
+        [np.zeros((n, 1)), np.cumsum(np.where(known, ratio, 0), axis=1, dtype=float)], axis=1
+    )
+    counts = np.concatenate(
+        [np.zeros((n, 1), np.int32), np.cumsum(known, axis=1, dtype=np.int32)], axis=1
+    )
+    inner = np.hypot(np.maximum(x - cell / 2, 0), altitude_m[:, None]) / sample_m
+    outer = np.hypot(x + cell / 2, altitude_m[:, None]) / sample_m
+    low = np.clip(np.floor(inner), 0, width - 1).astype(np.int32)
+    high = np.clip(np.maximum(np.ceil(outer), low + 1), 1, width).astype(np.int32)
+    number = np.take_along_axis(counts, high, 1) - np.take_along_axis(counts, low, 1)
+    total = np.take_along_axis(sums, high, 1) - np.take_along_axis(sums, low, 1)
+    inside = (number > 0) & (outer <= width + 1)
+    echo: FloatArray = np.where(inside, total / np.maximum(number, 1), np.nan)
+    middle = np.clip((np.hypot(x, altitude_m[:, None]) / sample_m).astype(np.int32), 0, width - 1)
+    shadow: BoolArray = inside & (np.take_along_axis(label, middle, 1) == SHADOW)
+    # Ground before the first echo (on a slope, or beside nadir) is floor all the same; ground past the last
+    # sample of its ping is not.
+    last = np.where(known.any(axis=1), width - known[:, ::-1].argmax(axis=1), 0)
+    seen: BoolArray = outer <= last[:, None] + 1
     return echo, shadow, seen
 
 

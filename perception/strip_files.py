@@ -49,7 +49,7 @@ def strip_dataset(strip: ElevationStrip, utc: bool = True) -> xarray.Dataset:
         if name == "shadow":
             values = values.astype(np.int8)
         elif len(dimensions) == 2:
-            values = values.astype(np.float32)
+            values = values.astype(np.float32, copy=False)
         attributes: dict[str, object] = {"long_name": long_name}
         if name == "time_s":
             attributes["units"] = "seconds since 1970-01-01T00:00:00Z" if utc else "s"

@@ -36,7 +36,7 @@ from perception.objects import (
 from perception.quality import CellFlag, cell_flags, saturated_samples
 from perception.readers.raw import PingFlag
 from perception.records import BoolArray, ElevationStrip, FloatArray, InputError, IntArray, Swath
-from perception.strip_columns import add_object, columns_across, lay_on_columns
+from perception.strip_columns import add_object, columns_across, lay_on_columns, stretches
 from perception.unseen import hidden_sigma
 
 logger = logging.getLogger(__name__)
@@ -131,14 +131,19 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
     swath, lead_m = levelled(replace(swath, depth_m=known_depth(swath)), tracked.first_return_m)
     lines = _level(swath, tracked, along_m, sample_m, port.shape[1])
     sides, rows = _look(swath, (port, starboard), lines, sample_m, config)
-    strip, floor = _lay(swath, lines, sides, rows, sample_m, config)
     saturated = saturated_samples(port), saturated_samples(starboard)
+    # Of a long pass every array of its samples counts.
+    del port, starboard
+    strip, floor = _lay(swath, lines, sides, rows, sample_m, config)
     labels = sides[0][1].label, sides[1][1].label
     echo = sides[0][0].ratio, sides[1][0].ratio
     cells = cell_flags(swath, saturated, labels, echo, tracked.valid, along_m, lines.altitude_m,
                        strip.across_m, sample_m)  # fmt: skip
-    folded = layover_cells(strip.elevation_m, strip.across_m, -swath.depth_m, sample_m)
-    cells |= folded * np.uint8(CellFlag.AMBIGUOUS)
+    for part in stretches(len(cells)):
+        folded = layover_cells(
+            strip.elevation_m[part], strip.across_m, -swath.depth_m[part], sample_m
+        )
+        cells[part] |= folded * np.uint8(CellFlag.AMBIGUOUS)
     return PassResult(
         strip=replace(strip, lead_m=lead_m, flags=cells),
         floor=replace(floor, lead_m=lead_m, flags=cells),
@@ -230,19 +235,20 @@ def _lay(
     """Lay floor, objects, echo and shadow on the strip's columns; return it with objects and without."""
     across = columns_across(sides, sample_m, lines.altitude_m, config.cell_m)
     distance = np.unique(np.abs(across))
-    floor, sigma = floor_beside(
-        lines.height_m, lines.sigma_m, lines.along_m, distance, lines.roughness
-    )
+    beside = floor_beside(lines.height_m, lines.sigma_m, lines.along_m, distance, lines.roughness)
+    floor, sigma = (values.astype(np.float32) for values in beside)
+    del beside
     at = np.searchsorted(distance, np.abs(across))
     elevation, sigma = floor[:, at], sigma[:, at]
     echo, shadow, seen = lay_on_columns(sides, across, lines.altitude_m, sample_m)
-    bare, bare_sigma = (np.where(seen, v, np.nan).astype(np.float32) for v in (elevation, sigma))
+    elevation[~seen] = sigma[~seen] = np.nan
+    bare, bare_sigma = elevation.copy(), sigma.copy()
     for row in rows:
         add_object(elevation, sigma, row, across, lines.along_m)
-    sigma = np.hypot(sigma, hidden_sigma(shadow, across, lines.altitude_m))
+    np.hypot(sigma, hidden_sigma(shadow, across, lines.altitude_m), out=sigma)
     strip = ElevationStrip(
-        elevation_m=np.where(seen, elevation, np.nan).astype(np.float32),
-        sigma_m=np.where(seen, sigma, np.nan).astype(np.float32),
+        elevation_m=elevation,
+        sigma_m=sigma,
         across_m=across,
         echo=echo,
         shadow=shadow,

@@ -1,4 +1,4 @@
-"""Memory of `bathynav strips` on a file of 1x and of 10x: more lines, and one line that is longer.
+"""Memory of `bathynav strips` on a file of 1x and of 10x: more lines, and one line that is longer, up to 30x.
 
 Each case is the command itself in a process of its own, so that its peak of memory is its own.
 """
@@ -30,11 +30,12 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 
 
 def run(progress: Progress) -> Table:
-    """Make strips of the three files."""
+    """Make strips of the four files."""
     cases = (
         ("1x", _PINGS, _LINE_M),
         ("10x, ten times as many lines", _TIMES * _PINGS, _LINE_M),
         ("10x, one line", _TIMES * _PINGS, 1e6),
+        ("30x, one line", 3 * _TIMES * _PINGS, 1e6),
     )
     rows: list[Row] = []
     for number, (case, n, line_m) in enumerate(cases):

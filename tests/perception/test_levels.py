@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from perception import levels
 from perception.levels import HIGHLIGHT, NO_DATA, NOMINAL, SHADOW, independent_part, segment_levels
 
 
@@ -68,3 +69,15 @@ def test_mirroring_the_image_mirrors_the_labels() -> None:
     ratio = (_scene(100, 250) * rng.exponential(size=(100, 250))).astype(np.float32)
     label = segment_levels(ratio, 1.0).label
     np.testing.assert_array_equal(segment_levels(ratio[::-1], 1.0).label, label[::-1])
+
+
+@pytest.mark.parametrize("pings", [1, 17, 60])
+def test_stretches_of_pings_get_the_labels_of_the_whole_image(
+    pings: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Paths run on across the stretches' ends, both ways: to the bit, on speckle that leaves them undecided."""
+    rng = np.random.default_rng(4)
+    ratio = (_scene(100, 250) * rng.exponential(size=(100, 250))).astype(np.float32)
+    whole = segment_levels(ratio, 1.0).label
+    monkeypatch.setattr(levels, "_STRETCH", pings * 250)
+    np.testing.assert_array_equal(segment_levels(ratio, 1.0).label, whole)

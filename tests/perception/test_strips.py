@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from perception import levels, quality, strip_columns
 from perception.records import InputError
 from perception.strips import StripConfig, build_strip, common_samples
 from tests.perception.echo_fixtures import Survey, boulder, flat, gaussian, make_swath
@@ -135,3 +136,19 @@ def test_rough_ground_errs_as_its_sigma_claims() -> None:
     # Two passes are few independent floors: wider than the reach's 60-76 % and 90-98 %.
     assert 0.5 < np.mean(together < 1) < 0.85
     assert np.mean(together < 2) > 0.85
+
+
+def test_a_pass_worked_on_in_short_stretches_gives_the_same_strip(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    swath = make_swath(gaussian(1.4, 15, 15, 1.2), SURVEY, np.random.default_rng(12))
+    whole = build_strip(swath)
+    monkeypatch.setattr(levels, "_STRETCH", 20 * 500)
+    monkeypatch.setattr(strip_columns, "_LINES", 7)
+    monkeypatch.setattr(quality, "_PINGS", 13)
+    parts = build_strip(swath)
+    for one, other in ((parts.strip, whole.strip), (parts.floor, whole.floor)):
+        for name in ("elevation_m", "sigma_m", "echo", "shadow", "flags"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(parts.levels, whole.levels)
+    np.testing.assert_array_equal(parts.objects.height_m, whole.objects.height_m)
