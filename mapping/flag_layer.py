@@ -1,7 +1,8 @@
 """`flags.tif`: the quality flags of the strips' cells on the map, beside it.
 
 A cell of the map bears a flag where most of the data that fell into it do, of all passes together: ground that one
-pass saw in shadow and two others saw well is not in shadow.
+pass saw in shadow and two others saw well is not in shadow. Layover is settled pass by pass: a cell is ambiguous only
+where no pass saw it clearly (`mapping.looks`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy.typing as npt
 
 from mapping.cog import Kind
 from mapping.gridding import Spacing, Window, spacing_of
-from mapping.placed import PlacedStrip, boxes, placed, runs_on
+from mapping.placed import PlacedStrip, boxes, hull, placed, runs_on
 from mapping.rasters import write_bands
 from perception.quality import CellFlag
 from perception.records import BoolArray, ElevationStrip, FloatArray, Grid, IntArray
@@ -38,12 +39,21 @@ def map_flags(strips: Sequence[ElevationStrip], grid: Grid) -> npt.NDArray[np.ui
     """Return (rows, cols) flags of a map's cells, rows from the north; `NO_FLAGS` where it has no height."""
     row, col = round(grid.south_m / grid.cell_m), round(grid.west_m / grid.cell_m)
     window = Window(row, col, *grid.shape)
-    votes = no_votes(window)
+    votes, clear = no_votes(window), np.zeros((window.rows, window.cols), bool)
     for strip in strips:
-        if strip.flags is not None:
-            one = placed(strip)
-            vote(one, rows_of(strip), boxes(one, grid.cell_m), grid.cell_m, window, votes)
-    flags = decided(votes)[::-1]
+        if strip.flags is None:
+            continue
+        one = placed(strip)
+        blocks = boxes(one, grid.cell_m)
+        part = hull([box for _, _, box in blocks]).common(window) if blocks else None
+        if part is None:
+            continue
+        own = no_votes(part)
+        vote(one, rows_of(strip), blocks, grid.cell_m, part, own)
+        inner = part.within(window)
+        votes[inner] = added(votes[inner], own)
+        clear[inner] |= (own[..., 0] > 0) & ~mostly(own, CellFlag.AMBIGUOUS)
+    flags = decided(votes, clear)[::-1]
     # What the joint method infers beside all data has a height and nothing against it but its sigma.
     flags = np.where(flags == NO_FLAGS, 0, flags)
     return np.where(np.isfinite(grid.elevation_m), flags, NO_FLAGS).astype(np.uint8)
@@ -90,12 +100,27 @@ def _parts(spacing: Spacing) -> tuple[int, int]:
     return spacing.along_parts, spacing.across_parts
 
 
-def decided(votes: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
-    """Return (rows, cols) the flags that most data of a cell bear; `NO_FLAGS` where there are none."""
+def added(votes: npt.NDArray[np.uint16], more: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint16]:
+    """Return the sum of two counts, held at the type's greatest."""
+    return np.minimum(votes.astype(np.uint32) + more, 65535).astype(np.uint16)
+
+
+def mostly(votes: npt.NDArray[np.uint16], flag: CellFlag) -> BoolArray:
+    """Return in which cells (rows, cols) most data bear a flag."""
+    k = 1 + int(np.flatnonzero(flag.value == _BITS)[0])
+    return np.asarray(2 * votes[..., k].astype(np.int64) > votes[..., 0])
+
+
+def decided(votes: npt.NDArray[np.uint16], clear: BoolArray) -> npt.NDArray[np.uint8]:
+    """Return (rows, cols) the flags that most data of a cell bear; `NO_FLAGS` where there are none.
+
+    `clear` : where at least one pass's look is not ambiguous, which settles the others'.
+    """
     total = votes[..., 0].astype(np.int64)
     flags = np.zeros(total.shape, np.uint8)
     for k, bit in enumerate(_BITS, start=1):
         flags |= np.where(2 * votes[..., k].astype(np.int64) > total, bit, np.uint8(0))
+    flags &= np.where(clear, np.uint8(255 - CellFlag.AMBIGUOUS.value), np.uint8(255))
     return np.where(total > 0, flags, np.uint8(NO_FLAGS)).astype(np.uint8)
 
 

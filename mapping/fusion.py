@@ -7,9 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mapping.flag_layer import rows_of
 from mapping.gridding import Window
+from mapping.looks import settle, with_ambiguity
 from mapping.passes import add_spread, add_weighted, judge
 from mapping.placed import PassRaster, PlacedStrip, boxes, extent, on_window, placed
+from perception.quality import CellFlag
 from perception.records import (
     BoolArray,
     ElevationStrip,
@@ -57,7 +60,8 @@ def fuse(
     A pass gives a cell one height: its data there share altitude, attitude and sound speed, so their
     number does not make the mean better. Passes are averaged by inverse variance; one that lies beyond
     four sigma of at least two others is left out there, and where passes disagree more than their sigmas
-    say, the sigma of the mean grows by the same factor (Birge's ratio). The position's uncertainty adds
+    say, the sigma of the mean grows by the same factor (Birge's ratio). A look that is ambiguous by layover yields to
+    clear ones (`mapping.looks`). The position's uncertainty adds
     the slope times it.
 
     Parameters
@@ -81,7 +85,11 @@ def fuse(
     window = map_window(there, cell)
     rasters = []
     for index, strip in enumerate(there):
-        rasters.append(on_window(strip, boxes(strip, cell), cell, window))
+        blocks = boxes(strip, cell)
+        raster = on_window(strip, blocks, cell, window)
+        if raster is not None and _folds(strips[index]):
+            raster = with_ambiguity(raster, strip, rows_of(strips[index]), blocks, cell, window)
+        rasters.append(raster)
         progress("fusing strips", index + 1, len(strips))
     shape = (window.rows, window.cols)
     mean, sigma, count = combine([r for r in rasters if r is not None], shape, cell)
@@ -94,6 +102,11 @@ def fuse(
         sigma_m=sigma[::-1],
         count=count[::-1],
     )
+
+
+def _folds(strip: ElevationStrip) -> bool:
+    """Tell whether any sample of a strip is ambiguous."""
+    return strip.flags is not None and bool(np.any(strip.flags & CellFlag.AMBIGUOUS.value))
 
 
 def map_window(strips: Sequence[PlacedStrip], cell_m: float, most: int = LARGEST_MAP) -> Window:
@@ -136,6 +149,7 @@ def combine(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Combine passes into mean, sigma of the mean and count, each of `shape`, rows south to north."""
     keep = [np.isfinite(r.height_m) for r in rasters]
+    settle(rasters, keep, shape)
     sums = _sums(rasters, keep, shape)
     # Three rounds find up to three wrong passes in a cell; more than that and there is no majority.
     for _ in range(3):

@@ -21,7 +21,7 @@ from mapping.gridding import (
     bin_lines,
     spacing_of,
 )
-from perception.records import ElevationStrip, FloatArray, Trajectory
+from perception.records import BoolArray, ElevationStrip, FloatArray, Trajectory
 
 # Lines that share one bounding box: few enough to leave out most of a long strip, many enough to be quick.
 _BLOCK_LINES = 64
@@ -69,6 +69,7 @@ class PassRaster:
     """One strip on part of a window: cell (row, col) of it is the window's cell (row0 + row, col0 + col).
 
     `height_m`, `variance_m2`, `position_m2`, `count` (rows, cols); NaN and 0 no data. Rows run south to north.
+    `ambiguous` (rows, cols): where most of the pass's echoes are of two surfaces at one range; None nowhere.
     """
 
     row0: int
@@ -77,6 +78,7 @@ class PassRaster:
     variance_m2: FloatArray
     position_m2: FloatArray
     count: FloatArray
+    ambiguous: BoolArray | None = None
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -184,7 +186,7 @@ def on_window(
     touching = [(first, last, box) for first, last, box in blocks if box.common(window)]
     if not touching:
         return None
-    part = _hull([box for _, _, box in touching]).common(window)
+    part = hull([box for _, _, box in touching]).common(window)
     if part is None:
         return None
     spacing = spacing_of(strip.easting_m, strip.northing_m, strip.across_m, cell_m)
@@ -209,7 +211,8 @@ def runs_on(
     return _runs(touching, n) if touching else iter(())
 
 
-def _hull(windows: Sequence[Window]) -> Window:
+def hull(windows: Sequence[Window]) -> Window:
+    """Return the least window that holds all of them."""
     row, col = min(w.row for w in windows), min(w.col for w in windows)
     rows = max(w.row + w.rows for w in windows) - row
     return Window(row, col, rows, max(w.col + w.cols for w in windows) - col)

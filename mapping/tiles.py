@@ -11,11 +11,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from mapping.flag_layer import decided, no_votes, vote
+from mapping.flag_layer import added, decided, mostly, no_votes, vote
 from mapping.fusion import combine
 from mapping.mosaic import echo_sigma, level_db
 from mapping.placed import PassRaster, PlacedStrip, on_window
 from mapping.tile_plan import FiledStrip, TilePlan
+from perception.quality import CellFlag
 from perception.records import FloatArray
 
 Layers = dict[str, npt.NDArray[np.float32]]
@@ -35,27 +36,31 @@ def fuse_tile(plan: TilePlan, tile: tuple[int, int]) -> Layers | None:
     outer, core = plan.outer(tile, _RIM), plan.core(tile)
     heights: list[PassRaster] = []
     echoes: list[PassRaster] = []
-    votes = no_votes(core)
+    inner = core.within(outer)
+    votes, clear = no_votes(core), np.zeros((core.rows, core.cols), bool)
     for index in plan.touching(tile):
         one, blocks = plan.strips[index], plan.boxes[index]
         height = on_window(one.strip, blocks, plan.cell_m, outer)
         echo = on_window(_echoes(one), blocks, plan.cell_m, core)
-        vote(one.strip, one.file.flags, blocks, plan.cell_m, core, votes)
+        own = no_votes(outer)
+        vote(one.strip, one.file.flags, blocks, plan.cell_m, outer, own)
+        folded = mostly(own, CellFlag.AMBIGUOUS)
+        votes = added(votes, own[inner])
+        clear |= (own[inner][..., 0] > 0) & ~folded[inner]
         if height is not None:
-            heights.append(height)
+            heights.append(replace(height, ambiguous=folded[height.window]))
         if echo is not None:
             echoes.append(echo)
     if not heights and not echoes:
         return None
     mean, sigma, count = combine(heights, (outer.rows, outer.cols), plan.cell_m)
     power, _, _ = combine(echoes, (core.rows, core.cols), plan.cell_m)
-    inner = core.within(outer)
     layers = {
         "elevation": mean[inner],
         "sigma": sigma[inner],
         "count": count[inner],
         "echo": level_db(power),
-        "flags": np.where(np.isfinite(mean[inner]), decided(votes), np.nan),
+        "flags": np.where(np.isfinite(mean[inner]), decided(votes, clear), np.nan),
     }
     return {name: np.ascontiguousarray(layers[name][::-1], np.float32) for name in LAYERS}
 
