@@ -26,7 +26,8 @@ from mapping.overlaps import find_overlaps
 from mapping.pose_graph import Link
 from mapping.pose_graph_solve import solve
 from mapping.rasters import read_map
-from mapping.survey import CorrectedSurvey, correct_survey
+from mapping.survey import correct_survey
+from mapping.survey_records import CorrectedSurvey
 from mapping.trajectories import read_trajectory
 from perception.readers import Survey, open_survey
 from perception.records import ElevationStrip, FloatArray, Grid, Progress, Trajectory
@@ -134,6 +135,7 @@ def _map_rows(label: str, reading: str, case: Case, result: SurveyMap, seconds: 
     before, after = (track_rms_m(t, case.track) for t in (result.raw_track, result.track))
     return [
         Row(label, reading, "map mean absolute error", error.mean_absolute_m, "m", "<= 0.12", "middle"),
+        Row(label, reading, "map mean error", error.bias_m, "m", "", "heights too great where positive"),
         Row(label, reading, "moved by the track's mean error", map_error(moved, case.floor).mean_absolute_m,
             "m", "", f"by {np.hypot(*off):.2f} m"),
         Row(label, reading, "map within 1 sigma", 100 * error.within_one_sigma, "%", "60-76"),
