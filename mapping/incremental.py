@@ -19,8 +19,9 @@ from mapping.comparison_memory import QUICK, SETTLED, ComparisonMemory
 from mapping.fixes import PositionFix
 from mapping.pose_graph import Solution
 from mapping.pose_graph_incremental import IncrementalGraph
-from mapping.survey import CorrectedSurvey, Round, SurveyConfig, assemble, correct_survey
+from mapping.survey import assemble, correct_survey
 from mapping.survey_check import check
+from mapping.survey_records import CorrectedSurvey, Round, SurveyConfig
 from perception.records import BoolArray, ElevationStrip, Progress, silent
 
 logger = logging.getLogger(__name__)

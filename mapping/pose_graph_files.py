@@ -17,7 +17,7 @@ import numpy as np
 from mapping.graph_files import PoseGraph, write_g2o
 from mapping.keyframes import Keyframes
 from mapping.pose_graph import Blend, Solution, build, gauss_newton, perpendicular
-from mapping.survey import CorrectedSurvey
+from mapping.survey_records import CorrectedSurvey
 from perception.files import write_text
 from perception.records import FloatArray
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from mapping.survey import Round
+from mapping.survey_records import Round
 from perception.files import write_text
 
 _HEADER = (

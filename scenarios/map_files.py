@@ -34,7 +34,7 @@ from mapping.quality import (
 )
 from mapping.rasters import write_map
 from mapping.round_files import write_rounds
-from mapping.survey import CorrectedSurvey
+from mapping.survey_records import CorrectedSurvey
 from mapping.tile_figures import map_figures, tile_figures
 from mapping.tile_fill import with_fill
 from mapping.tile_store import FILL_LAYERS

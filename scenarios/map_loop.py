@@ -11,7 +11,8 @@ import numpy as np
 from mapping.compare import same_frame
 from mapping.fixes import PositionFix
 from mapping.fusion import default_cell, fuse
-from mapping.survey import CorrectedSurvey, correct_survey, gain_in_likeness, tie_to_map
+from mapping.survey import correct_survey, gain_in_likeness, tie_to_map
+from mapping.survey_records import CorrectedSurvey
 from perception.records import ElevationStrip, Grid, Progress, silent
 
 if TYPE_CHECKING:

@@ -16,8 +16,10 @@ import numpy as np
 from mapping.fixes import PositionFix
 from mapping.fusion import fuse
 from mapping.incremental import pass_by_pass
+from mapping.object_floors import on_floor
 from mapping.one_sided import hold_one_sided
-from mapping.survey import CorrectedSurvey, correct_survey
+from mapping.survey import correct_survey
+from mapping.survey_records import CorrectedSurvey
 from perception.attitude import levelled
 from perception.bottom import BottomTrack
 from perception.levels import SHADOW
@@ -160,7 +162,11 @@ def map_survey(
         grid = with_pose_sigma(held, track, corrected.height_sigma_m)
     grid = replace(grid, datum=survey.datum)
     raw = navigated_track(survey)
-    objects = tuple(corrected_objects(p.objects, raw, track) for p in results)
+    objects = tuple(
+        on_floor(corrected_objects(p.objects, raw, track), grid,
+                 track.easting_m[p.objects.ping], track.northing_m[p.objects.ping])
+        for p in results
+    )  # fmt: skip
     return SurveyMap(grid, track, raw, results, corrected, objects, inversion)
 
 

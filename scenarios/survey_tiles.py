@@ -20,7 +20,8 @@ from mapping.compare import same_frame
 from mapping.fixes import PositionFix
 from mapping.fusion import default_cell, fuse
 from mapping.placed import PlacedStrip, position_variance
-from mapping.survey import CorrectedSurvey, SurveyConfig, correct_survey, tie_to_map
+from mapping.survey import correct_survey, tie_to_map
+from mapping.survey_records import CorrectedSurvey, SurveyConfig
 from mapping.textures import MatchConfig
 from mapping.tile_figures import map_figures
 from mapping.tile_fill import fill_tiles, with_fill

@@ -18,7 +18,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from mapping.fixes import PositionFix
-from mapping.survey import CorrectedSurvey, SurveyConfig, correct_survey
+from mapping.survey import correct_survey
+from mapping.survey_records import CorrectedSurvey, SurveyConfig
 from perception.records import ElevationStrip, FloatArray, Progress
 from scenarios.benchmarks import Row, Table
 from scenarios.metrics import percent_cut

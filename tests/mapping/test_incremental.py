@@ -11,7 +11,8 @@ from mapping.comparison_memory import QUICK, ComparisonMemory
 from mapping.incremental import IncrementalSurvey, pass_by_pass
 from mapping.pose_graph import GraphConfig
 from mapping.pose_graph_solve import solve
-from mapping.survey import SurveyConfig, correct_survey
+from mapping.survey import correct_survey
+from mapping.survey_records import SurveyConfig
 from perception.records import InputError
 from tests.mapping.test_survey import error, fixes, flown  # noqa: F401
 from tests.mapping.worlds import Flight

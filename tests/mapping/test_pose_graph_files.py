@@ -16,7 +16,7 @@ from mapping.pose_graph import Blend, GraphConfig, HeightStep, Solution
 from mapping.pose_graph_files import survey_poses, write_graph
 from mapping.pose_graph_sets import gtsam_factors, gtsam_values
 from mapping.pose_graph_solve import solve
-from mapping.survey import CorrectedSurvey, Diagnostics
+from mapping.survey_records import CorrectedSurvey, Diagnostics
 from perception.records import FloatArray, Trajectory
 from tests.mapping.gtsam_text import read_graph
 from tests.mapping.test_pose_graph import end_fixes, flights, true_links

@@ -7,7 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from mapping.round_files import write_rounds
-from mapping.survey import Round
+from mapping.survey_records import Round
 
 
 def test_each_column_holds_the_field_that_it_names(tmp_path: Path) -> None:

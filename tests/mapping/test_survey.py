@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapping import survey
+from mapping import survey_loop
 from mapping.fixes import PositionFix
 from mapping.pose_graph import GraphConfig
 from mapping.pose_graph_files import write_graph
-from mapping.survey import SurveyConfig, correct_survey
+from mapping.survey import correct_survey
+from mapping.survey_records import SurveyConfig
 from perception.records import InputError
 from tests.mapping.worlds import Drift, Flight, fly, make_world
 
@@ -82,7 +83,7 @@ def test_a_survey_whose_every_match_is_refused_is_whole_and_can_be_written(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Each round one chance match, sixty metres off: the graph refuses it, and no link is left."""
-    plain = survey.register
+    plain = survey_loop.register
 
     def spoilt(*given: object, **more: object) -> object:
         results, links = plain(*given, **more)  # type: ignore[arg-type]
@@ -96,7 +97,7 @@ def test_a_survey_whose_every_match_is_refused_is_whole_and_can_be_written(
             else ([(w, replace(m, accepted=False)) for w, m in results], [])
         )
 
-    monkeypatch.setattr(survey, "register", spoilt)
+    monkeypatch.setattr(survey_loop, "register", spoilt)
     rng = np.random.default_rng(2)
     legs = [(60.0, 20.0, 0.0, 120.0), (20.0, 80.0, 90.0, 120.0)]
     flown = fly(make_world(rng, size=200), legs, rng, Drift(0.0, 0.0, 0.0), turn_m=200.0)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mapping.rasters import read_map
-from mapping.survey import CorrectedSurvey, correct_survey, gain_in_likeness
+from mapping.survey import correct_survey, gain_in_likeness
+from mapping.survey_records import CorrectedSurvey
 from perception.readers import open_survey
 from perception.records import Grid
 from scenarios import map_loop
