@@ -125,6 +125,8 @@ def _write_passes(
         tables.append(result.objects)
         if keep:
             kept.append(PassSummary.of(result))
+        # Not until the next pass is there: the two together would take twice the room.
+        del result, strip
     if keep:
         keep_passes(survey, config, tuple(kept))
     objects = ObjectTable.joined(tables)
