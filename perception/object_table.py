@@ -34,6 +34,9 @@ class ObjectTable:
     gain : log likelihood over a flat floor.
     probability : that it is an object (or crater) and not the floor's own relief.
     lower_bound : the shadow runs out of the swath, and `height_m` is the least that it proves.
+    drop_m : height of the sonar above the floor as taken: level with the floor below it.
+    floor_sigma_m : the part of `sigma_m` that the unknown floor makes, under the object and at its shadow's
+        end; a map that knows the floor takes it off (`mapping.object_floors`).
     """
 
     easting_m: FloatArray
@@ -53,6 +56,8 @@ class ObjectTable:
     gain: FloatArray
     probability: FloatArray
     lower_bound: BoolArray
+    drop_m: FloatArray
+    floor_sigma_m: FloatArray
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -103,6 +108,8 @@ class ObjectRow:
     gain: float = field(default=0.0)
     probability: float = field(default=1.0)
     lower_bound: bool = field(default=False)
+    drop_m: float = field(default=float("nan"))
+    floor_sigma_m: float = field(default=0.0)
     odds: float = field(default=float("inf"))
 
 

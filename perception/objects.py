@@ -86,12 +86,16 @@ class _Side:
 
 @dataclass(frozen=True, slots=True)
 class _Edges:
-    """A shadow's longest line: start and end (slant), the sonar's height there and its 1-sigma."""
+    """A shadow's longest line: start and end (slant), the sonar's height there and its 1-sigma.
+
+    `floor_sigma_m` is that of the floor at the shadow's end against the floor below the sonar.
+    """
 
     start_m: float
     end_m: float
     drop_m: float
     drop_sigma_m: float
+    floor_sigma_m: float
 
     @property
     def length_m(self) -> float:
@@ -190,12 +194,10 @@ def _edges(shadow: Shadow, seen: _Side) -> _Edges:
     start_m, end_m = (int(edge[peak]) * seen.sample_m for edge in (shadow.start, shadow.end))
     floor_sigma = 0.0
     if seen.ground is not None:
-        # The floor at the shadow's end against the floor below the sonar.
         away = np.sqrt(max(end_m**2 - drop**2, 0.0))
         floor_sigma = float(np.sqrt(seen.ground.variogram(np.array(away))))
-    return _Edges(
-        start_m, end_m, drop, float(np.hypot(seen.track.altitude_sigma_m[row], floor_sigma))
-    )
+    drop_sigma = float(np.hypot(seen.track.altitude_sigma_m[row], floor_sigma))
+    return _Edges(start_m, end_m, drop, drop_sigma, floor_sigma)
 
 
 def _fitted(shadow: Shadow, edges: _Edges, order: float, seen: _Side) -> BumpFit | None:
@@ -247,28 +249,30 @@ def _of_fit(
     relative = np.hypot(relative, 0.25 * np.clip(1.3 - x0 / drop, 0.0, 0.8))
     half = max(half_across, half_along)
     hill = fit.sign > 0
+    ring, end = _relief(half, edges, seen)
     return ObjectRow(
         easting_m=np.nan, northing_m=np.nan, kind="hill" if hill else "crater",
-        height_m=height, sigma_m=float(np.hypot(height * relative, _relief(half, edges, seen))),
+        height_m=height, sigma_m=float(np.sqrt((height * relative) ** 2 + ring**2 + end**2)),
         slant_range_m=edges.start_m, shadow_length_m=edges.length_m, pass_index=0, ping=0,
         across_m=float(x0), along_m=float(y0), half_across_m=half_across, half_along_m=half_along,
-        shape=beta, gain=fit.gain,
+        shape=beta, gain=fit.gain, drop_m=drop,
+        floor_sigma_m=float(np.hypot(end, height * edges.floor_sigma_m / drop)),
         odds=object_odds(edges.proved_m(hill), half, *look, seen.roughness),
     )  # fmt: skip
 
 
-def _relief(half_size_m: float, edges: _Edges, seen: _Side) -> float:
-    """Return what the floor's own relief leaves open of a height, 1-sigma (m).
+def _relief(half_size_m: float, edges: _Edges, seen: _Side) -> tuple[float, float]:
+    """Return what the floor's own relief leaves open of a height, around it and at its shadow's end, 1-sigma (m).
 
     The ring around a footprint, against which a height stands, averages over several differences: half
     the variogram. The floor at the shadow's end lies above or below the object's foot by a difference of its own:
     ``dH = z_end Rs / (Rs + Ls)``.
     """
     if seen.ground is None:
-        return 0.0
+        return 0.0, 0.0
     ground = [float(ground_range(np.array(v), np.array(edges.drop_m))) for v in (edges.start_m, edges.end_m)]  # fmt: skip
     ring, end = seen.ground.variogram(np.array([half_size_m, ground[1] - ground[0]]))
-    return float(np.sqrt(0.5 * ring + 2 * end * (edges.start_m / edges.end_m) ** 2))
+    return float(np.sqrt(0.5 * ring)), float(np.sqrt(2 * end) * edges.start_m / edges.end_m)
 
 
 def _fitted_half_m(fit: BumpFit | None) -> float:
@@ -309,6 +313,7 @@ def _of_shadow(
         sigma_m=sigma, slant_range_m=edges.start_m, shadow_length_m=edges.length_m,
         pass_index=0, ping=0, across_m=x_start if hill else 0.5 * (x_start + x_end),
         along_m=middle, half_across_m=half_across, half_along_m=half, lower_bound=shadow.open,
+        drop_m=edges.drop_m, floor_sigma_m=edges.floor_sigma_m * edges.length_m / edges.end_m,
         odds=object_odds(height, land_m, *look, seen.roughness),
     )  # fmt: skip
 

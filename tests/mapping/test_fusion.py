@@ -170,7 +170,7 @@ def a_table(rows: list[tuple[float, float, str, float, float]], which: int) -> O
         height_m=np.array(height), sigma_m=np.array(sigma), slant_range_m=zero,
         shadow_length_m=zero, pass_index=np.full(n, which), ping=np.zeros(n, int), across_m=zero,
         along_m=zero, half_across_m=zero, half_along_m=zero, shape=zero, gain=zero,
-        probability=zero + 1, lower_bound=zero > 0,
+        probability=zero + 1, lower_bound=zero > 0, drop_m=zero + 10, floor_sigma_m=zero,
     )  # fmt: skip
 
 
