@@ -271,31 +271,48 @@ def add_odometry(
     absolute: bool,
     first: int = 0,
 ) -> None:
-    """Add corrections from keyframe `first` on and the way between: a random walk, scale and course error.
+    """Add corrections from keyframe `first` on and the way between (`ways`)."""
+    add_starts(graph, values, keyframes, config, absolute, first)
+    effects, sigma_m = ways(keyframes, config)
+    for k in range(first, len(keyframes)):
+        if np.isfinite(sigma_m[k]):
+            graph.add(
+                _linear(
+                    (E(k - 1), -np.eye(2)),
+                    (E(k), np.eye(2)),
+                    (B(int(keyframes.strip[k - 1])), -effects[k]),
+                    gtsam.noiseModel.Isotropic.Sigma(2, sigma_m[k]),
+                )
+            )
 
-    e[k] - e[k-1] = scale * d + bias * perpendicular(d) + walk, with d the navigation's step.
-    """
-    position = np.column_stack([keyframes.easting_m, keyframes.northing_m])
+
+def add_starts(
+    graph: Any,
+    values: Any,
+    keyframes: Keyframes,
+    config: GraphConfig,
+    absolute: bool,
+    first: int = 0,
+) -> None:
+    """Add corrections from keyframe `first` on, and what is known of those that no way leads to."""
     start_m = config.start_with_fixes_m if absolute else config.start_m
     start = gtsam.noiseModel.Isotropic.Sigma(2, start_m)
     for k in range(first, len(keyframes)):
         values.insert(E(k), np.zeros(2))
-        way = keyframes.way_m[k]
-        if not np.isfinite(way):
+        if not np.isfinite(keyframes.way_m[k]):
             graph.add(gtsam.PriorFactorVector(E(k), np.zeros(2), start))
-            continue
-        step = position[k] - position[k - 1]
-        walk = np.hypot(config.drift_m_per_sqrt_km * np.sqrt(way / 1000.0), keyframes.jump_m[k])
-        effect = np.column_stack([step, perpendicular(step), np.zeros(2)])
-        noise = gtsam.noiseModel.Isotropic.Sigma(2, max(walk, 1e-3))
-        graph.add(
-            _linear(
-                (E(k - 1), -np.eye(2)),
-                (E(k), np.eye(2)),
-                (B(int(keyframes.strip[k - 1])), -effect),
-                noise,
-            )
-        )
+
+
+def ways(keyframes: Keyframes, config: GraphConfig) -> tuple[FloatArray, FloatArray]:
+    """Return (k, 2, 3) what pass errors do to the way from the keyframe before, and (k,) the walk's 1-sigma on it.
+
+    e[k] - e[k-1] = scale * d + bias * perpendicular(d) + walk, with d the navigation's step. NaN where no way leads.
+    """
+    position = np.column_stack([keyframes.easting_m, keyframes.northing_m])
+    step = np.diff(position, axis=0, prepend=position[:1])
+    effects = np.stack([step, perpendicular(step), np.zeros_like(step)], axis=-1)
+    walk_m = config.drift_m_per_sqrt_km * np.sqrt(keyframes.way_m / 1000.0)
+    return effects, np.maximum(np.hypot(walk_m, keyframes.jump_m), 1e-3)
 
 
 def add_link(graph: Any, values: Any, keyframes: Keyframes, link: Link, number: int) -> int:

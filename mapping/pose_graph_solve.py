@@ -26,11 +26,12 @@ from mapping.pose_graph import (
     Link,
     Solution,
     add_fix,
-    add_odometry,
     add_passes,
+    add_starts,
     add_step,
     perpendicular,
     same_dive,
+    ways,
 )
 from mapping.pose_graph_root import Root
 from perception.records import BoolArray, FloatArray
@@ -64,14 +65,14 @@ class LinearGraph:
     ) -> None:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         add_passes(graph, values, keyframes, config)
-        add_odometry(graph, values, keyframes, config, absolute=bool(fixes))
+        add_starts(graph, values, keyframes, config, absolute=bool(fixes))
         sure = graph.size()
         for step in steps:
             add_step(graph, step)
         for fix in fixes:
             add_fix(graph, fix)
         linear = graph.linearize(values)
-        self._sure = [linear.at(i) for i in range(sure)]
+        self._sure = [linear.at(i) for i in range(sure)] + _way_factors(keyframes, config)
         self.doubtful = [_link_factor(keyframes, link) for link in links]
         self.doubtful += [linear.at(i) for i in range(sure, linear.size())]
         # The weight that each carries now: GTSAM holds it as a noise model.
@@ -119,6 +120,19 @@ class LinearGraph:
             logger.info("pose graph: solved by QR: %s", str(error).strip().splitlines()[0])
         net = graph.eliminateSequential(self._ordering, gtsam.EliminateQR)
         return net, net.optimize()
+
+
+def _way_factors(keyframes: Keyframes, config: GraphConfig) -> list[Any]:
+    """Return the way between keyframes, as `pose_graph.add_odometry` has it."""
+    effects, sigma_m = ways(keyframes, config)
+    eye, nothing = np.eye(2), np.zeros(2)
+    return [
+        gtsam.JacobianFactor(
+            E(k - 1), -eye, E(k), eye, B(int(keyframes.strip[k - 1])), -effects[k], nothing,
+            gtsam.noiseModel.Isotropic.Sigma(2, sigma_m[k]),
+        )
+        for k in np.flatnonzero(np.isfinite(sigma_m)).tolist()
+    ]  # fmt: skip
 
 
 def _link_factor(keyframes: Keyframes, link: Link) -> Any:
@@ -287,7 +301,7 @@ def log_evidence(
         return float("nan")
     chained = int(same_dive(keyframes).sum()) if config.shared else 0
     half_of_priors = -1.5 * chained * np.log(1.0 - config.shared**2)
-    return float(half_of_priors - graph.error(values) - Root.of(net).half_log_det)
+    return float(half_of_priors - graph.error(values) - net.logDeterminant())
 
 
 def _solution(
