@@ -201,17 +201,21 @@ def solve(
     config: GraphConfig | None = None,
     robust: bool = True,
     steps: Sequence[HeightStep] = (),
+    decided: Solution | None = None,
 ) -> Solution:
     """Solve the survey's graph; wrong registrations and fixes are found by graduated non-convexity.
 
     Parameters
     ----------
     robust : False takes every registration and fix at its word.
+    decided : an answer to the same links, fixes and steps: what it doubted is doubted, no more and no less.
     """
     config = config or GraphConfig()
     linear = LinearGraph(keyframes, links, fixes, config, steps)
     used = np.ones(len(linear.doubtful), bool)
-    if robust and len(used):
+    if decided is not None:
+        used = np.concatenate([decided.link_used, decided.step_used, decided.fix_used])
+    elif robust and len(used):
         used = consistent(linear, config)
     graph = linear.graph(used.astype(float))
     try:

@@ -91,4 +91,8 @@ def _most_evident(
             best, most = shared, found
     if best == config.shared and config == first.config:
         return first
-    return solve(keyframes, links, fixes, replace(config, shared=best), steps=steps)
+    # The size of height offsets has no say in the plane, and smaller ones clear no step that was doubted.
+    same = best == first.config.shared and config.height_m <= first.config.height_m
+    decided = first if same else None
+    config = replace(config, shared=best)
+    return solve(keyframes, links, fixes, config, steps=steps, decided=decided)
