@@ -15,6 +15,8 @@ from perception.records import FloatArray
 # Ground that no two sides see, or that none sees, is known no better than this part of the soundings' sigma: the
 # rms error of one pass was 0.7 to 0.9 of theirs on four floors.
 _ONE_SIDED_PART = 0.8
+# A bottom track is early or late by centimetres throughout, whatever the number of its soundings.
+_LATE_M = 0.02
 # Long waves are few among the unknowns and hold nearly all of the spread: they are solved to a sigma in all, not
 # to a part of the whole.
 _TOLERANCE = 1.0
@@ -22,9 +24,14 @@ _TOLERANCE = 1.0
 _AT_ONCE = 4
 
 
-def spread(state: State, solved: Solved, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Return the 1-sigma of the heights, jointly and from the soundings alone, by perturbation."""
-    weight = solved.data.weight * state.config.independent
+def spread(
+    state: State, solved: Solved, rng: np.random.Generator, part: float = 1.0
+) -> tuple[FloatArray, FloatArray]:
+    """Return the 1-sigma of the heights, jointly and from the soundings alone, by perturbation.
+
+    `part` : of the data that else would count as independent, where cells are narrower than was asked for.
+    """
+    weight = solved.data.weight * state.config.independent * part
     joint = linear_problem(state, replace(solved.data, weight=weight), solved.equations)
     alone = linear_problem(state, None, present_soundings(state))
     return _sample_sigma(joint, state, rng), _sample_sigma(alone, state, rng)
@@ -45,8 +52,12 @@ def _sample_sigma(problem: Problem, state: State, rng: np.random.Generator) -> F
     return np.sqrt(ndimage.uniform_filter(total / state.config.samples, 7, mode="nearest"))
 
 
-def honest_sigma(state: State, solved: Solved, joint: FloatArray, alone: FloatArray) -> FloatArray:
+def honest_sigma(
+    state: State, solved: Solved, joint: FloatArray, alone: FloatArray, lead_part: float = 0.5
+) -> FloatArray:
     """Return the sigma of the map, and hold the map to what the soundings allow.
+
+    `lead_part` : how much of the first returns' lead is not known, as a part of it.
 
     A height further from the soundings' surface than four of its sigmas and half the relief is no finding but a failure
     of the model: it is drawn back, and its sigma is that of the soundings.
@@ -57,8 +68,9 @@ def honest_sigma(state: State, solved: Solved, joint: FloatArray, alone: FloatAr
     limit = 4 * np.hypot(alone, 0.5 * relief)
     beyond = np.abs(state.surface - base) > limit
     state.surface = np.clip(state.surface, base - limit, base + limit)
-    # The lead of the first returns shifts the whole map; it is known to about a half.
-    sigma = np.sqrt(joint**2 + (0.5 * float(np.mean(state.lead_m))) ** 2)
+    # The lead of the first returns shifts the whole map, and so does a track that is late throughout.
+    level = np.hypot(lead_part * float(np.mean(state.lead_m)), _LATE_M)
+    sigma = np.hypot(joint, level)
     both_sides = np.zeros(state.shape, bool)
     lit = np.bincount(solved.data.rows.cell, minlength=solved.single.size).reshape(
         solved.single.shape

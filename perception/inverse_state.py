@@ -35,6 +35,8 @@ class InversionConfig:
     caution : weight, in units of the prior, that holds a step to the present surface from the second
         on, where nearly all the ground is seen from one side: what echoes cannot tell from gain moves
         little.
+    fine_steps : steps on cells half as wide that follow, where the map is small enough for them.
+    fine_nodes : nodes of the narrower cells up to which those steps are taken; 0 for none.
     nodes_at_once : nodes beyond which the first steps are taken on wider cells.
     max_cells : nodes beyond which a cell that was not asked for is enlarged.
     """
@@ -50,6 +52,8 @@ class InversionConfig:
     independent: float = 0.3
     shadows: bool = False
     caution: float = 4.0
+    fine_steps: int = 3
+    fine_nodes: int = 500_000
     nodes_at_once: int = 250_000
     max_cells: int = 4_000_000
 

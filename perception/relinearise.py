@@ -56,7 +56,7 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
         data = _linearise(state, rows, first=k == 0, smooth=smooth)
         equations = present_soundings(state)
         single = one_sided(rows, state.shape)
-        alone = float(np.sum(single)) >= _MOSTLY_ONE_SIDED * float(np.sum(passed))
+        alone = mostly_one_sided(single, passed)
         if state.base is None:
             # Once the first returns' lead is known: the surface of the soundings alone.
             state.base = sounding_surface(state)
@@ -94,10 +94,18 @@ def iterate(state: State, steps: int, progress: Progress, rng: np.random.Generat
             "joint inversion: iteration %d, %d data, residual %.3f, step %.3f m, %d solver steps",
             k + 1, len(rows.cell), state.residual[-1], step, used,
         )  # fmt: skip
-        progress("joint inversion", k + 2, state.config.iterations + 3)
+        # Steps on narrower cells come on top of those foreseen.
+        progress(
+            "joint inversion", min(k, state.config.iterations) + 2, state.config.iterations + 3
+        )
         if step < 0.02 and not smooth:
             break
     return solved
+
+
+def mostly_one_sided(single: BoolArray, passed: BoolArray) -> bool:
+    """Return whether nearly all the ground that rays passed was seen from one side only."""
+    return float(np.sum(single)) >= _MOSTLY_ONE_SIDED * float(np.sum(passed))
 
 
 def _dark(state: State, first: bool) -> list[BoolArray]:
