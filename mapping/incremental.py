@@ -19,6 +19,7 @@ from mapping.comparison_memory import QUICK, SETTLED, ComparisonMemory
 from mapping.fixes import PositionFix
 from mapping.pose_graph import Solution
 from mapping.pose_graph_incremental import IncrementalGraph
+from mapping.pose_graph_solve import with_range_scale
 from mapping.survey import assemble, correct_survey
 from mapping.survey_check import check
 from mapping.survey_records import CorrectedSurvey, Round, SurveyConfig
@@ -120,7 +121,7 @@ class IncrementalSurvey:
             _used(survey.steps, batch.step_used),
         )
         found = self._graph.solution()
-        return replace(
+        updated = replace(
             batch,
             correction_m=found.correction_m,
             covariance_m2=found.covariance_m2,
@@ -129,6 +130,7 @@ class IncrementalSurvey:
             height_m=found.height_m,
             height_sigma_m=found.height_sigma_m,
         )
+        return with_range_scale(updated, survey.keyframes, survey.links, survey.ties, survey.steps)
 
 
 def _used(factors: Sequence[_Factor], used: BoolArray) -> list[_Factor]:

@@ -10,7 +10,7 @@ import pytest
 from mapping.comparison_memory import QUICK, ComparisonMemory
 from mapping.incremental import IncrementalSurvey, pass_by_pass
 from mapping.pose_graph import GraphConfig
-from mapping.pose_graph_solve import solve
+from mapping.pose_graph_solve import solve, with_range_scale
 from mapping.survey import correct_survey
 from mapping.survey_records import SurveyConfig
 from perception.records import InputError
@@ -47,6 +47,7 @@ def test_each_pass_updates_the_track_and_the_end_is_the_batchs(
         so_far.keyframes, kept, so_far.ties, so_far.solution.config, robust=False,
         steps=[s for s, ok in zip(so_far.steps, so_far.solution.step_used, strict=True) if ok],
     )  # fmt: skip
+    batch = with_range_scale(batch, so_far.keyframes, kept, so_far.ties)
     np.testing.assert_allclose(so_far.solution.correction_m, batch.correction_m, atol=1e-5)
     np.testing.assert_allclose(so_far.solution.covariance_m2, batch.covariance_m2, rtol=1e-4)
 
