@@ -136,7 +136,7 @@ def _round(
     said = Round(
         floor="soundings" if given.floor is None else "map",
         square_m=side_m,
-        compared=len(results),
+        compared=len(found),
         accepted=len(links),
         used=sum(r.used for r in found),
         beyond=len(every) - len(reached),

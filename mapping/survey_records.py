@@ -44,13 +44,14 @@ class Round:
     ----------
     floor : what told where echoes came from: "soundings" or "map".
     square_m : width of the compared squares.
-    compared, accepted, used : comparisons made, accepted by themselves, believed by the graph.
+    compared, accepted, used : comparisons that count here, accepted by themselves, believed by the graph.
     beyond : squares left for later, their shift expected wider than any search.
     evidence : mean log-likelihood ratio of a comparison against no match, refused ones included.
     moved_m : rms by which the track still moved.
     error_before, error_after : the graph's error (half a chi-square).
     passes : how many there were.
-    anew : comparisons made in this round; the others held still since an earlier correction (`ComparisonMemory`).
+    anew : comparisons made in this round; the others stood, matched in the round before or held still since an
+        earlier correction (`ComparisonMemory`).
     """
 
     floor: str

@@ -81,7 +81,7 @@ def _rows(survey: Planted, result: CorrectedSurvey, passes: int) -> list[Row]:
     )
     kept = result.solution
     sigma = np.sqrt(np.trace(kept.covariance_m2, axis1=1, axis2=2).mean())
-    compared = sum(r.compared for r in result.diagnostics.rounds)
+    compared = sum(r.anew for r in result.diagnostics.rounds)
     case = f"{passes} passes x {_PINGS} pings, {len(result.keyframes)} keyframes"
     method = "registration and graph"
     return [
