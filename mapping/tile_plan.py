@@ -22,7 +22,7 @@ from perception.files import existing_file, whole_file
 from perception.records import BoolArray, FloatArray, InputError
 
 # Part of every tile's key: raise it when the same strips would give another map.
-_METHOD = 2
+_METHOD = 3
 # A tile of 1,024 cells holds some 40 MB of sums while it is made, and 12 MB in the store.
 TILE_CELLS = 1024
 # Lattices beyond this are a mistake of units rather than a survey.

@@ -81,6 +81,7 @@ def predict(parameters: FloatArray, form: Form, scene: Scene, out: FloatArray) -
     rays = len(_RAYS) if scene.beam > 0.0 else 1
     for i in range(out.shape[0]):
         out[i, :] = 0.0
+        beside = 0.0
         for j in range(rays):
             part, bearing = 1.0, scene.yaw[i]
             if rays > 1:
@@ -91,7 +92,7 @@ def predict(parameters: FloatArray, form: Form, scene: Scene, out: FloatArray) -
                 half = sx * (rho_end**form.corner - dy**form.corner) ** (1.0 / form.corner)
                 x_low, x_high = max(x0 - half, 0.02 * scene.drop_m[i]), x0 + half
             if x_high <= x_low:
-                out[i, :] += part * (1.0 + scene.leak)
+                beside += part
                 continue
             ray[:] = 0.0
             resume = _trace(
@@ -99,7 +100,11 @@ def predict(parameters: FloatArray, form: Form, scene: Scene, out: FloatArray) -
                 scene.drop_m[i], scene.start_m, scene.step_m, scene.facet_m,
             )  # fmt: skip
             _add_floor(ray, x_low, resume, law, scene.drop_m[i], scene)
-            out[i, :] += part * ray
+            for k in range(len(ray)):
+                out[i, k] += part * ray[k]
+        if beside > 0.0:
+            for k in range(len(ray)):
+                out[i, k] += beside * (1.0 + scene.leak)
     return out
 
 
