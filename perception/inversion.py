@@ -33,7 +33,7 @@ __all__ = ["InversionConfig", "InversionResult", "Look", "invert"]
 _WHOLE = 6
 # Errors of the model are shared over ground, not over a number of cells: of four cells in the place of one fewer count as
 # independent. (A quarter was cautious on rough floors of three simulated surveys, the whole bold by a half when crossed.)
-_FINE_DATA_PART = 0.4
+_FINE_DATA_PART = 0.6
 # Echoes traced on narrow cells tell more of the level: errors of maps were a tenth of the lead, 0.5 at most.
 _FINE_LEAD_PART = 0.25
 

@@ -20,6 +20,8 @@ from perception.soundings import Equations, bilinear_rows
 
 # Looks whose mean direction has at least this length come from one side (1 = all from one direction).
 _ONE_SIDED = 0.8
+# The same of their doubled directions: looks from opposite sides count as one axis, at right angles as none.
+_ONE_AXIS = 0.7
 _STRETCH_CELLS = 4
 # The mean of so few points is no profile.
 _FEW = 3
@@ -34,6 +36,17 @@ def one_sided(rows: Rows, shape: tuple[int, int]) -> BoolArray:
     north = np.bincount(rows.cell, rows.c_north / length, minlength=duals)
     mean = np.hypot(east, north) / np.maximum(count, 1)
     return ((count > 0) & (mean > _ONE_SIDED)).reshape(shape[0] - 1, shape[1] - 1)
+
+
+def uncrossed(rows: Rows, shape: tuple[int, int]) -> BoolArray:
+    """Return (rows - 1, cols - 1), True where all looks at a cell lie along one axis, from one side or both."""
+    duals = (shape[0] - 1) * (shape[1] - 1)
+    angle = 2 * np.arctan2(rows.c_east, rows.c_north)
+    count = np.bincount(rows.cell, minlength=duals)
+    along = np.bincount(rows.cell, np.cos(angle), minlength=duals)
+    aside = np.bincount(rows.cell, np.sin(angle), minlength=duals)
+    mean = np.hypot(along, aside) / np.maximum(count, 1)
+    return ((count > 0) & (mean > _ONE_AXIS)).reshape(shape[0] - 1, shape[1] - 1)
 
 
 def mean_profiles(

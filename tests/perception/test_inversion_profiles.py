@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.testing import assert_allclose
 
-from perception.profiles import mean_profiles
+from perception.profiles import mean_profiles, uncrossed
 from perception.rays import Rays
+from perception.shading import Rows
 
 _SHAPE, _CELL_M = (41, 61), 1.0
 # Northwards along easting 10 m, looking east over 40 m.
@@ -46,3 +47,16 @@ def test_ground_that_is_not_held_gives_no_profile() -> None:
     assert mean_profiles(*frame, held, 0.1).matrix.shape == (2, 41 * 61)
     none = mean_profiles(*frame, np.zeros((40, 60), bool), 0.1, relative=True)
     assert none.matrix.shape == (0, 41 * 61) and len(none.value) == 0
+
+
+def test_looks_from_opposite_sides_are_uncrossed_and_those_at_right_angles_not() -> None:
+    """Cell 0 is seen from west and east, cell 1 from west and south, cell 2 from west alone; cell 3 not at all."""
+    cell = np.array([0, 0, 1, 1, 2])
+    east = np.array([1.0, -2.0, 1.0, 0.0, 3.0])
+    north = np.array([0.0, 0.0, 0.0, 1.0, 0.0])
+    n = np.zeros(5)
+    rows = Rows(
+        cell=cell, c_east=east, c_north=north, c_level=n, ratio=n, ground_m=n, drop_m=n, slope=n,
+        angle_rad=n, slant_m=n, share=n, samples=n, side=cell, look=cell,
+    )  # fmt: skip
+    assert uncrossed(rows, (3, 3)).ravel().tolist() == [True, False, True, False]
