@@ -171,7 +171,9 @@ def _tied_in_the_plane(
 ) -> CorrectedSurvey:
     east_m, north_m = expected_size(survey)
     cell_m = max(default_cell(strips), float(np.sqrt(east_m * north_m / _PICTURE_CELLS)))
-    draft = fuse(corrected.strips, cell_m, survey.crs, corrected.trajectory)
+    # Thin strips bear the flags of any of their samples: too many to settle looks by.
+    coarse = [replace(strip, flags=None) for strip in corrected.strips]
+    draft = fuse(coarse, cell_m, survey.crs, corrected.trajectory)
     same_frame(draft, prior)
     return tie_to_map(strips, corrected, draft, prior)
 
