@@ -32,7 +32,7 @@ __all__ = ["InversionConfig", "InversionResult", "Look", "invert"]
 # A survey asked for fewer steps than this is a draft: it takes none on narrower cells.
 _WHOLE = 6
 # Errors of the model are shared over ground, not over a number of cells: of four cells in the place of one fewer count as
-# independent. (A quarter was cautious on rough floors of three simulated surveys, the whole bold by a half when crossed.)
+# independent. (0.4 was cautious on rough floors, the whole bold by a half on crossed ones.)
 _FINE_DATA_PART = 0.6
 # Echoes traced on narrow cells tell more of the level: errors of maps were a tenth of the lead, 0.5 at most.
 _FINE_LEAD_PART = 0.25
