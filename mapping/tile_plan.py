@@ -192,12 +192,17 @@ class TilePlan:
         return [_digest(one) for one in self.strips]
 
 
+# Poses and offsets (m, rad) that differ by less are the same: a graph solved again ends a 1e-11 m aside, and no tile
+# has to be made anew for that.
+_SAME = 1e-5
+
+
 def _digest(one: FiledStrip) -> bytes:
     """Return the digest of a strip: its rows, where it lies, how high and how sure."""
     digest = hashlib.blake2b(one.file.digest.encode(), digest_size=16)
-    digest.update(repr((one.strip.height_m, one.strip.height_sigma_m)).encode())
-    for array in (*_poses(one).values(), one.strip.across_m, one.strip.reach_m):
-        digest.update(np.ascontiguousarray(array).tobytes())
+    offset = np.array([one.strip.height_m, one.strip.height_sigma_m])
+    for array in (offset, *_poses(one).values(), one.strip.across_m, one.strip.reach_m):
+        digest.update(np.round(np.asarray(array, float) / _SAME).tobytes())
     return digest.digest()
 
 
