@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import time
+import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +26,14 @@ if TYPE_CHECKING:
     from perception.records import Progress
     from planning.limits import VehicleLimits
     from planning.planner import Plan
+
+logger = logging.getLogger(__name__)
+
+# What a route was held by, and what a plan of its rest may need again.
+_HELD_BY = {
+    "objects": "--objects", "avoid": "--avoid", "position_sigma": "--position-sigma", "currents": "--currents",
+    "cost_path": "--cost", "map_sigma": "--map-sigma", "error_correlation": "--error-correlation",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +187,7 @@ def replanned(run: Run) -> None:
     given = run.given
     assert given.old_route is not None
     old = read_route(given.old_route)
+    _tell_of_forgotten(run, given.old_route)
     state = old.state_at(given.travelled)
     rest = old.rest(given.travelled)
     left = float(old.distance_m[-1] - given.travelled)
@@ -205,7 +216,34 @@ def replanned(run: Run) -> None:
         rows = [
             ("length", f"{found.length_m:.1f} m"),
             ("cost", f"{found.cost:.1f}"),
+            ("altitude", f"mean {found.mean_altitude_m:.2f} m, least {found.min_altitude_m:.2f} m"),
+            ("clearance", clearance_told(found, surface.limits.floor_m, surface.k)),
             ("stand-off", f"{found.min_stand_off_m:.2f} m"),
             ("written", str(run.out / "route.csv")),
         ]
         print_table("replanned", rows)
+
+
+def _tell_of_forgotten(run: Run, old_route: Path) -> None:
+    """Say what the old route was held by and this run is not: nothing of it is taken over by itself."""
+    path = old_route.parent / "config.toml"
+    if not path.is_file():
+        return
+    try:
+        old = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        logger.warning("%s: cannot tell what the old route was held by (%s)", path, error)
+        return
+    for key, option in _HELD_BY.items():
+        if old.get(key) and not getattr(run.given, key):
+            logger.warning(
+                "%s was planned with %s %s and this run is without: give it again if it still holds",
+                old_route, option, old[key],
+            )  # fmt: skip
+    limits = run.config["vehicle"]
+    changed = [k for k, v in old.get("vehicle", {}).items() if k in limits and limits[k] != v]
+    if changed and run.given.vehicle is None:
+        logger.warning(
+            "%s was planned for a vehicle of other limits (%s): give its --vehicle again",
+            old_route, ", ".join(changed),
+        )  # fmt: skip

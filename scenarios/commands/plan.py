@@ -148,6 +148,10 @@ def command(out: Path, quiet: bool, verbose: bool, picture: bool, **options: Any
     set_verbosity(quiet, verbose)
     given = Given(**options)
     _refuse_mixed(given)
+    if given.old_route is not None and given.old_route.resolve().parent == out.resolve():
+        raise click.UsageError(
+            f"--replan {given.old_route} lies in --out itself and would be written over; give another --out"
+        )
     out = prepare_out(out)
     from planning.limits import VehicleLimits, read_vehicle
     from scenarios.route_outputs import clear, resolved, write_unsolved

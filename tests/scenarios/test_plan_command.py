@@ -127,6 +127,27 @@ def test_a_survey_of_an_area_writes_lines_that_cover_it(chart, tmp_path):
     assert metrics["covered_share"] >= 0.99 and metrics["solved"] is True
 
 
+def test_replanning_tells_what_held_the_old_route_and_is_not_given_again(chart, tmp_path, caplog):
+    objects = tmp_path / "objects.csv"
+    objects.write_text(
+        f"easting_m,northing_m,kind,height_m,sigma_m\n{WEST + 30},{NORTH - 30},hill,1.0,0.1\n"
+    )
+    vehicle = tmp_path / "v.toml"
+    vehicle.write_text("[vehicle]\nfloor_m = 6\n")
+    held = ("--objects", objects, "--vehicle", vehicle)
+    assert plan(chart, tmp_path / "a", *held).exception is None
+    again = ("--map", chart, "--replan", tmp_path / "a" / "route.csv", "--travelled", 50,
+             "--out", tmp_path / "b", "--region-weights", "none", "--no-picture")  # fmt: skip
+    assert run(*again).exception is None
+    assert "was planned with --objects" in caplog.text and "(floor_m): give" in caplog.text
+    caplog.clear()
+    assert run(*again, *held).exception is None
+    assert "was planned" not in caplog.text
+    # Into its own folder the old route would be gone before it is read.
+    same = run(*again[:6], "--out", tmp_path / "a")
+    assert "another --out" in str(same.exception) and (tmp_path / "a" / "route.csv").exists()
+
+
 def test_replanning_starts_where_the_vehicle_is(chart, tmp_path):
     assert plan(chart, tmp_path / "a").exception is None
     result = run(
