@@ -28,8 +28,8 @@ _SIGMA_NAMES = ("sigma", "uncertainty", "std", "stddev", "standard deviation")
 _ELEVATION_NAMES = ("elevation", "bathymetry", "height", "z", "topo", "depth")
 # What makers write for "no data" and forget to declare; no sea floor stands at these to the digit.
 _SENTINELS = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0)
-# Deeper than any sea and higher than any mountain: no height, whatever it stands for.
-_IMPOSSIBLE_M = 12_000.0
+# No height, whatever it stands for: makers fill with 1e20 or the largest float. (An odd datum may add millions.)
+_IMPOSSIBLE_M = 1e9
 # Metres in a unit of height; the survey foot differs from the foot by two parts in a million.
 _UNITS_M = {
     "ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "us-ft": 1200 / 3937, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937,

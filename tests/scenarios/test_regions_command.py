@@ -125,15 +125,18 @@ def test_degrees_are_refused_with_the_way_out(tmp_path):
     assert "gdalwarp" in refused(path, "--out", tmp_path / "out")
 
 
+@pytest.mark.parametrize("option", ["--scale", "--window", "--detail", "--map-sigma"])
+def test_lengths_below_zero_are_wrong_usage(tmp_path, option):
+    done = run(tmp_path / "map.tif", "--out", tmp_path / "out", option, -2)
+    assert done.exit_code == 2 and option in done.output and not (tmp_path / "out").exists()
+
+
 def test_impossible_options_and_missing_files_are_refused(tmp_path):
     path = write(tmp_path / "map.tif", hill(32))
-    assert "scale" in refused(path, "--out", tmp_path / "out", "--scale", -2)
     out = tmp_path / "out"
     assert "exclude" in refused(path, "--out", out, "--scale", 2, "--window", 5)
     assert "needs a --window" in refused(path, "--out", out, "--method", "box")
     assert "goes with" in refused(path, "--out", out, "--method", "difference", "--window", 5)
-    assert "window" in refused(path, "--out", out, "--window", -5)
-    assert "detail" in refused(path, "--out", out, "--detail", -5)
     assert "no such file" in refused(tmp_path / "none.tif", "--out", tmp_path / "out")
     missing = tmp_path / "objects.gpkg"
     assert "objects.gpkg" in refused(path, "--out", tmp_path / "out", "--objects", missing)
