@@ -81,9 +81,11 @@ class ComparisonMemory:
         self.compared = 0
         self._seen: dict[tuple[float, ...], _Seen] = {}
         self._now: list[_Seen] = []
+        self._keyframes: Keyframes | None = None
 
     def recall(self, given: Circumstances) -> dict[int, Match]:
         """Return the matches that hold still, by the number of their window, at the passes' present places."""
+        self._use(given.keyframes)
         self._now = _states(given)
         found = {}
         for number, (window, now) in enumerate(zip(given.windows, self._now, strict=True)):
@@ -91,6 +93,12 @@ class ComparisonMemory:
             if then is not None and _unchanged(then, now, given.cell_m, self.tolerance):
                 found[number] = _carried(then, now)
         return found
+
+    def _use(self, keyframes: Keyframes) -> None:
+        """Forget the constraints, which name keyframes by number, where earlier passes are cut otherwise now."""
+        if self._keyframes is not None and not self._keyframes.cut_alike(keyframes):
+            self._seen = {key: replace(seen, link=None) for key, seen in self._seen.items()}
+        self._keyframes = keyframes
 
     def keep(
         self,

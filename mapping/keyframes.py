@@ -44,6 +44,13 @@ class Keyframes:
     def __len__(self) -> int:
         return len(self.strip)
 
+    def cut_alike(self, other: Keyframes) -> bool:
+        """Return whether the strips that both hold have the same lines for keyframes."""
+        strips, lines = min(len(self.starts), len(other.starts)), min(len(self), len(other))
+        return np.array_equal(self.starts[:strips], other.starts[:strips]) and np.array_equal(
+            self.line[:lines], other.line[:lines]
+        )
+
     def nearest(self, strip: int, line: float) -> int:
         """Return the keyframe of `strip` that is nearest to `line`."""
         first, last = int(self.starts[strip]), int(self.starts[strip + 1])

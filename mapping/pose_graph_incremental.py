@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable, Sequence
 from typing import Any
 
@@ -50,10 +51,7 @@ class IncrementalGraph:
     def goes_on(self, keyframes: Keyframes, config: GraphConfig, absolute: bool) -> bool:
         """Return whether the graph can grow to these keyframes; where other things are assumed it begins anew."""
         known = self._keyframes
-        same = known is None or (
-            np.array_equal(known.starts, keyframes.starts[: len(known.starts)])
-            and np.array_equal(known.line, keyframes.line[: len(known)])
-        )
+        same = known is None or (len(known) <= len(keyframes) and known.cut_alike(keyframes))
         return same and config == self._config and absolute == self._absolute
 
     def add_passes(self, keyframes: Keyframes) -> None:
@@ -80,10 +78,10 @@ class IncrementalGraph:
             raise ValueError("add a pass before its registrations")
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         factors: list[Link | KeyframeFix | HeightStep] = [*links, *fixes, *steps]
-        wanted = [_name(factor) for factor in factors]
+        wanted = _names(factors)
         places: dict[Hashable, range] = {}
         for name, factor in zip(wanted, factors, strict=True):
-            if name in self._held or name in places:
+            if name in self._held:
                 continue
             before = int(graph.size())
             if isinstance(factor, Link):
@@ -127,11 +125,24 @@ class IncrementalGraph:
         )
 
 
-def _name(factor: Link | KeyframeFix | HeightStep) -> Hashable:
-    """Return what tells a factor from every other."""
+def _names(factors: Sequence[Link | KeyframeFix | HeightStep]) -> list[Hashable]:
+    """Return what tells each factor from every other: what it says, and how often that was said before."""
+    said: Counter[Hashable] = Counter()
+    names: list[Hashable] = []
+    for factor in factors:
+        content = _content(factor)
+        names.append((content, said[content]))
+        said[content] += 1
+    return names
+
+
+def _content(factor: Link | KeyframeFix | HeightStep) -> Hashable:
     if isinstance(factor, HeightStep):
         return factor
     if isinstance(factor, KeyframeFix):
         return factor.keyframe, factor.correction_m.tobytes(), factor.covariance_m2.tobytes()
     ends = np.concatenate([factor.first_offset_m, factor.second_offset_m, factor.shift_m])
-    return factor.first, factor.second, ends.tobytes(), factor.covariance_m2.tobytes()
+    return (
+        factor.first, factor.second, ends.tobytes(), factor.covariance_m2.tobytes(),
+        factor.first_blend, factor.second_blend,
+    )  # fmt: skip

@@ -11,6 +11,7 @@ from mapping.comparison_memory import QUICK, ComparisonMemory
 from mapping.incremental import IncrementalSurvey, pass_by_pass
 from mapping.pose_graph import GraphConfig
 from mapping.pose_graph_solve import solve, with_range_scale
+from mapping.rounds import ends_of
 from mapping.survey import correct_survey
 from mapping.survey_records import SurveyConfig
 from perception.records import InputError
@@ -76,10 +77,30 @@ def test_the_same_passes_again_are_not_compared_again(flown: list[Flight]) -> No
     np.testing.assert_array_equal(second.trajectory.easting_m, first.trajectory.easting_m)
 
 
+def test_keyframes_chosen_anew_leave_no_constraint_on_the_old_ones(
+    flown: list[Flight],  # noqa: F811
+) -> None:
+    """Squares stay, keyframes move closer together: what is remembered is tied to those of now."""
+    strips, given = [f.strip for f in flown], fixes(flown)
+    memory = ComparisonMemory(tolerance=QUICK)
+    correct_survey(strips, given, CONFIG, memory=memory)
+    closer = replace(CONFIG, keyframe_m=4.0)
+    compared = memory.compared
+    ours, plain = (correct_survey(strips, given, closer, memory=m) for m in (memory, None))
+    assert memory.compared - compared < 0.5 * sum(r.compared for r in ours.diagnostics.rounds)
+    for survey in (ours, plain):
+        for window, link in zip(survey.squares, survey.links, strict=True):
+            ends = ends_of(survey.keyframes, window)
+            assert (link.first, link.second) == ends
+    sigma = np.sqrt(np.trace(plain.solution.covariance_m2, axis1=1, axis2=2))
+    apart = np.hypot(*(ours.solution.correction_m - plain.solution.correction_m).T)
+    assert np.sqrt(((apart / sigma) ** 2).mean()) < 0.5
+
+
 def test_a_match_is_carried_with_the_passes_and_compared_again_when_they_moved_too_far(
     flown: list[Flight],  # noqa: F811
 ) -> None:
-    """Moved by a twentieth of a metre all links stay the same; moved by metres they are made anew."""
+    """Moved by a fiftieth of a metre all links stay the same; moved by metres they are made anew."""
     strips, given = [f.strip for f in flown], fixes(flown)
     memory = ComparisonMemory(tolerance=QUICK)
     correct_survey(strips, given, CONFIG, memory=memory)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
-from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution
+from mapping.pose_graph import Blend, GraphConfig, HeightStep, Link, Solution
 from mapping.pose_graph_incremental import IncrementalGraph
 from mapping.pose_graph_solve import solve
 from tests.mapping.test_pose_graph import end_fixes, flights, true_links
@@ -67,6 +67,21 @@ def test_a_registration_taken_out_again_leaves_no_trace() -> None:
     assert graph.solution().link_used.sum() == len(kept)
     graph.hold(links, ties, steps)
     same(graph.solution(), solve(keyframes, links, ties, CONFIG, robust=False, steps=steps))
+
+
+def test_what_is_said_twice_counts_twice() -> None:
+    """Two fixes alike, and two registrations that differ in their blends alone."""
+    keyframes, _, links, ties = survey(6)
+    blended = replace(links[0], first_blend=Blend(links[0].first - 1, links[0].first, 0.5))
+    graph = IncrementalGraph(CONFIG, absolute=True)
+    graph.add_passes(keyframes)
+    for more in (
+        ([*links, blended, links[1]], [*ties, ties[-1]]),
+        (links, ties),
+        ([*links, links[1]], [ties[0], *ties]),
+    ):
+        graph.hold(*more)
+        same(graph.solution(), solve(keyframes, *more, CONFIG, robust=False))
 
 
 def test_a_graph_goes_on_only_under_the_assumptions_that_it_began_with() -> None:
