@@ -20,6 +20,7 @@ from perception.geodesy import (
 )
 from perception.passes import PassConfig, Track, split_passes
 from perception.readers.compass import compass_warning, heading_offsets
+from perception.readers.places import refuse_two_places
 from perception.readers.raw import PingFlag, RawFile, plural, spread_rows
 from perception.readers.repair import mend_clock, mend_headings, mend_positions
 from perception.records import BoolArray, FloatArray, InputError, IntArray, Swath
@@ -123,6 +124,10 @@ class Survey:
         if installation is not None:
             table = installation.apply(table, all(raw.utc for raw in files))
         _refuse_unusable(files, table)
+        refuse_two_places(
+            [raw.path.name for raw in files],
+            table.file, table.easting_m, table.northing_m, table.usable,
+        )  # fmt: skip
         _check_scale(files, table, target, warnings)
         if not np.isfinite(table.depth_m).any():
             warnings.append(

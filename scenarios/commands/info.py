@@ -222,10 +222,12 @@ def _altitude_defect(survey: Survey) -> list[str]:
 
 
 def _length_m(survey: Survey, rows: IntArray) -> float:
-    import numpy as np
+    """Return the way sailed as `strips` measures it: the stairs of coarse positions do not lengthen it."""
+    from perception.geometry import progress_along
 
-    east, north = survey.pings.easting_m[rows], survey.pings.northing_m[rows]
-    return float(np.hypot(np.diff(east), np.diff(north)).sum())
+    table = survey.pings
+    way = progress_along(table.easting_m[rows], table.northing_m[rows], table.time_s[rows])
+    return float(way[-1] - way[0]) if len(way) else 0.0
 
 
 def _span(values: FloatArray | IntArray, unit: str, digits: int) -> str:

@@ -191,3 +191,30 @@ def test_a_local_grid_survives_a_map_file(tmp_path):
 
     write_map(tmp_path / "a.tif", Grid(np.ones((5, 5)), 0.0, 5.0, 1.0, crs=LOCAL_CRS))
     assert read_map(tmp_path / "a.tif").crs == LOCAL_CRS
+
+
+def test_files_of_two_places_are_no_survey(tmp_path, bathynav):
+    here = make_xtf(tmp_path / "here.xtf", Plan())
+    there = make_xtf(
+        tmp_path / "there.xtf", Plan(track=lambda t: (-68.8, 51.5 + 2.0 * t / 111200.0, 0.0))
+    )
+    status, out, _ = bathynav("info", here, there)
+    assert status == 0
+    assert (
+        "do not make one: there.xtf lies 33" in out and "average" not in out.split("survey of")[1]
+    )
+    status, out, err = bathynav("strips", here, there, "--out", tmp_path / "strips")
+    assert status == 1 and out == ""
+    assert len(err.strip().splitlines()) == 1 and "each by itself" in err
+
+
+def test_positions_in_whole_metres_do_not_lengthen_the_track(tmp_path, bathynav):
+    def stairs(t: float) -> tuple[float, float, float]:
+        way = 2.0 * t / np.sqrt(2.0)
+        return 500000.0 + round(way), 5000000.0 + round(way + 0.4), 45.0
+
+    path = make_xtf(tmp_path / "a.xtf", Plan(n=600, track=stairs, nav_units=0))
+    _, out, _ = bathynav("info", path)
+    (track,) = (line.split() for line in out.splitlines() if line.strip().startswith("track"))
+    # 599 steps of 0.2 s at 2 m/s.
+    assert abs(float(track[1]) - 239.6) < 0.04 * 239.6
