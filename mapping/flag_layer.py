@@ -2,7 +2,7 @@
 
 A cell of the map bears a flag where most of the data that fell into it do, of all passes together: ground that one
 pass saw in shadow and two others saw well is not in shadow. Layover is settled pass by pass: a cell is ambiguous only
-where no pass saw it clearly (`mapping.looks`).
+where no pass saw it clearly (`mapping.looks`), and a pass in whose shadow it lies heard nothing of it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def map_flags(strips: Sequence[ElevationStrip], grid: Grid) -> npt.NDArray[np.ui
     """Return (rows, cols) flags of a map's cells, rows from the north; `NO_FLAGS` where it has no height."""
     row, col = round(grid.south_m / grid.cell_m), round(grid.west_m / grid.cell_m)
     window = Window(row, col, *grid.shape)
-    votes, clear = no_votes(window), np.zeros((window.rows, window.cols), bool)
+    votes = no_votes(window)
+    folded, clear = (np.zeros((window.rows, window.cols), bool) for _ in range(2))
     for strip in strips:
         if strip.flags is None:
             continue
@@ -52,8 +53,9 @@ def map_flags(strips: Sequence[ElevationStrip], grid: Grid) -> npt.NDArray[np.ui
         vote(one, rows_of(strip), blocks, grid.cell_m, part, own)
         inner = part.within(window)
         votes[inner] = added(votes[inner], own)
-        clear[inner] |= (own[..., 0] > 0) & ~mostly(own, CellFlag.AMBIGUOUS)
-    flags = decided(votes, clear)[::-1]
+        folded[inner] |= mostly(own, CellFlag.AMBIGUOUS)
+        clear[inner] |= mostly_clear(own)
+    flags = decided(votes, folded & ~clear)[::-1]
     # What the joint method infers beside all data has a height and nothing against it but its sigma.
     flags = np.where(flags == NO_FLAGS, 0, flags)
     return np.where(np.isfinite(grid.elevation_m), flags, NO_FLAGS).astype(np.uint8)
@@ -105,22 +107,33 @@ def added(votes: npt.NDArray[np.uint16], more: npt.NDArray[np.uint16]) -> npt.ND
     return np.minimum(votes.astype(np.uint32) + more, 65535).astype(np.uint16)
 
 
-def mostly(votes: npt.NDArray[np.uint16], flag: CellFlag) -> BoolArray:
-    """Return in which cells (rows, cols) most data bear a flag."""
-    k = 1 + int(np.flatnonzero(flag.value == _BITS)[0])
-    return np.asarray(2 * votes[..., k].astype(np.int64) > votes[..., 0])
+def mostly(votes: npt.NDArray[np.uint16], *flags: CellFlag) -> BoolArray:
+    """Return in which cells (rows, cols) most data bear a flag, or one of several that exclude each other."""
+    bearing = np.zeros(votes.shape[:-1], np.int64)
+    for flag in flags:
+        bearing += votes[..., 1 + int(np.flatnonzero(flag.value == _BITS)[0])]
+    return np.asarray(2 * bearing > votes[..., 0])
 
 
-def decided(votes: npt.NDArray[np.uint16], clear: BoolArray) -> npt.NDArray[np.uint8]:
+def mostly_clear(votes: npt.NDArray[np.uint16]) -> BoolArray:
+    """Return in which cells (rows, cols) a pass heard one surface: there are data, most neither folded nor in shadow.
+
+    A strip has heights in its shadows too, but they are inferred: no echo speaks for them.
+    """
+    return (votes[..., 0] > 0) & ~mostly(votes, CellFlag.AMBIGUOUS, CellFlag.SHADOW)
+
+
+def decided(votes: npt.NDArray[np.uint16], open_: BoolArray) -> npt.NDArray[np.uint8]:
     """Return (rows, cols) the flags that most data of a cell bear; `NO_FLAGS` where there are none.
 
-    `clear` : where at least one pass's look is not ambiguous, which settles the others'.
+    `open_` : where a pass's look is ambiguous and no other's is clear: there, not by votes, a cell is ambiguous.
     """
     total = votes[..., 0].astype(np.int64)
     flags = np.zeros(total.shape, np.uint8)
     for k, bit in enumerate(_BITS, start=1):
         flags |= np.where(2 * votes[..., k].astype(np.int64) > total, bit, np.uint8(0))
-    flags &= np.where(clear, np.uint8(255 - CellFlag.AMBIGUOUS.value), np.uint8(255))
+    flags &= np.uint8(255 - CellFlag.AMBIGUOUS.value)
+    flags |= np.where(open_, np.uint8(CellFlag.AMBIGUOUS.value), np.uint8(0))
     return np.where(total > 0, flags, np.uint8(NO_FLAGS)).astype(np.uint8)
 
 

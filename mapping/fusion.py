@@ -83,11 +83,13 @@ def fuse(
         placed(strip, trajectory, float(one)) for strip, one in zip(strips, sigma_m, strict=True)
     ]
     window = map_window(there, cell)
+    # Of passes that fold nowhere too, what lies in shadow settles nothing.
+    folded = any(_folds(strip) for strip in strips)
     rasters = []
     for index, strip in enumerate(there):
         blocks = boxes(strip, cell)
         raster = on_window(strip, blocks, cell, window)
-        if raster is not None and _folds(strips[index]):
+        if raster is not None and folded and strips[index].flags is not None:
             raster = with_ambiguity(raster, strip, rows_of(strips[index]), blocks, cell, window)
         rasters.append(raster)
         progress("fusing strips", index + 1, len(strips))

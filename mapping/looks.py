@@ -3,7 +3,8 @@
 The founding paper: returns that arrive together are ambiguous, but from one position only; as the vehicle moves, or
 comes again from elsewhere, the same two surfaces are told apart. Strips flag such samples (`perception.layover`);
 here the look that agrees with a clear one joins it, the look that does not is left out, and where no pass saw a
-cell clearly all of them stand, their disagreement in sigma, and the cell stays flagged.
+cell clearly all of them stand, their disagreement in sigma, and the cell stays flagged. A height inferred in a
+shadow is no clear look: it stands beside the others, and settles nothing.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapping.flag_layer import FlagRows, mostly, no_votes, vote
+from mapping.flag_layer import FlagRows, mostly, mostly_clear, no_votes, vote
 from mapping.gridding import Window
 from mapping.passes import add_weighted
 from mapping.placed import PassRaster, PlacedStrip
@@ -32,7 +33,7 @@ def with_ambiguity(
     cell_m: float,
     window: Window,
 ) -> PassRaster:
-    """Return a pass's raster on a window with its ambiguous cells marked.
+    """Return a pass's raster on a window with its ambiguous and its clear cells marked.
 
     Parameters
     ----------
@@ -42,19 +43,18 @@ def with_ambiguity(
     part = Window(window.row + raster.row0, window.col + raster.col0, rows, cols)
     votes = no_votes(part)
     vote(strip, flags, blocks, cell_m, part, votes)
-    folded = mostly(votes, CellFlag.AMBIGUOUS)
-    return replace(raster, ambiguous=folded) if folded.any() else raster
+    return replace(raster, ambiguous=mostly(votes, CellFlag.AMBIGUOUS), clear=mostly_clear(votes))
 
 
 def settle(
     rasters: Sequence[PassRaster], keep: Sequence[BoolArray], shape: tuple[int, int]
 ) -> None:
     """Take from `keep`, in place, the ambiguous looks that clear ones of the same cell contradict."""
-    if all(r.ambiguous is None for r in rasters):
+    if not any(r.ambiguous is not None and r.ambiguous.any() for r in rasters):
         return
     weight, total, number = (np.zeros(shape) for _ in range(3))
     for r, k in zip(rasters, keep, strict=True):
-        clear = k if r.ambiguous is None else k & ~r.ambiguous
+        clear = k if r.clear is None else k & r.clear
         add_weighted(r.height_m, r.variance_m2, clear, weight[r.window], total[r.window],
                      number[r.window])  # fmt: skip
     for r, k in zip(rasters, keep, strict=True):

@@ -70,6 +70,7 @@ class PassRaster:
 
     `height_m`, `variance_m2`, `position_m2`, `count` (rows, cols); NaN and 0 no data. Rows run south to north.
     `ambiguous` (rows, cols): where most of the pass's echoes are of two surfaces at one range; None nowhere.
+    `clear` (rows, cols): where most are of one surface that sound reached, neither that nor shadow; None everywhere.
     """
 
     row0: int
@@ -79,6 +80,7 @@ class PassRaster:
     position_m2: FloatArray
     count: FloatArray
     ambiguous: BoolArray | None = None
+    clear: BoolArray | None = None
 
     @property
     def window(self) -> tuple[slice, slice]:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from mapping.flag_layer import added, decided, mostly, no_votes, vote
+from mapping.flag_layer import added, decided, mostly, mostly_clear, no_votes, vote
 from mapping.fusion import combine
 from mapping.mosaic import echo_sigma, level_db
 from mapping.placed import PassRaster, PlacedStrip, on_window
@@ -37,7 +37,8 @@ def fuse_tile(plan: TilePlan, tile: tuple[int, int]) -> Layers | None:
     heights: list[PassRaster] = []
     echoes: list[PassRaster] = []
     inner = core.within(outer)
-    votes, clear = no_votes(core), np.zeros((core.rows, core.cols), bool)
+    votes = no_votes(core)
+    open_, clear = (np.zeros((core.rows, core.cols), bool) for _ in range(2))
     for index in plan.touching(tile):
         one, blocks = plan.strips[index], plan.boxes[index]
         height = on_window(one.strip, blocks, plan.cell_m, outer)
@@ -46,9 +47,12 @@ def fuse_tile(plan: TilePlan, tile: tuple[int, int]) -> Layers | None:
         vote(one.strip, one.file.flags, blocks, plan.cell_m, outer, own)
         folded = mostly(own, CellFlag.AMBIGUOUS)
         votes = added(votes, own[inner])
-        clear |= (own[inner][..., 0] > 0) & ~folded[inner]
+        seen = mostly_clear(own)
+        open_ |= folded[inner]
+        clear |= seen[inner]
         if height is not None:
-            heights.append(replace(height, ambiguous=folded[height.window]))
+            where = height.window
+            heights.append(replace(height, ambiguous=folded[where], clear=seen[where]))
         if echo is not None:
             echoes.append(echo)
     if not heights and not echoes:
@@ -60,7 +64,7 @@ def fuse_tile(plan: TilePlan, tile: tuple[int, int]) -> Layers | None:
         "sigma": sigma[inner],
         "count": count[inner],
         "echo": level_db(power),
-        "flags": np.where(np.isfinite(mean[inner]), decided(votes, clear), np.nan),
+        "flags": np.where(np.isfinite(mean[inner]), decided(votes, open_ & ~clear), np.nan),
     }
     return {name: np.ascontiguousarray(layers[name][::-1], np.float32) for name in LAYERS}
 
