@@ -68,9 +68,11 @@ def correct_survey(
     keyframes = choose_keyframes(strips, config.keyframe_m or width_m / 12.0)
     ties = tie_fixes(fixes, strips, keyframes, config.graph.drift_m_per_sqrt_km)
     cell_m = config.match.cell_m or default_cell(strips)
+    # What the caller asks for stands; what the data give is held steady.
+    compared_m = config.match.cell_m or steady(cell_m)
     thin = [thinned(strip, 0.6 * cell_m) for strip in strips]
     given = Given(
-        thin, keyframes, ties, TextureStore(thin, config.match), width_m, steady(cell_m), config, floor,
+        thin, keyframes, ties, TextureStore(thin, config.match), width_m, compared_m, config, floor,
         progress, memory,
     )  # fmt: skip
     state = compare_rounds(given, known)

@@ -65,10 +65,13 @@ def compare_rounds(given: Given, known: CorrectedSurvey | None) -> State:
     squares = config.squares if known is None else config.squares[-1:]
     state = _begun(given, known)
     settled_m = config.settled_m or 0.2 * given.cell_m
-    for number in range(config.rounds or len(squares)):
+    rounds = config.rounds or len(squares)
+    for number in range(rounds):
         last = number >= len(squares) - 1
         part = squares[min(number, len(squares) - 1)]
-        if 0 < number < len(squares) - 2 and _needless(given, state, squares[number + 1]):
+        if 0 < number < min(rounds, len(squares)) - 2 and _needless(
+            given, state, squares[number + 1]
+        ):
             continue
         state = _round(given, state, part, last, known)
         for _ in range(_MORE_ROUNDS):

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from mapping import survey_loop
+from mapping import survey, survey_check, survey_loop
 from mapping.fixes import PositionFix
-from mapping.pose_graph import GraphConfig
+from mapping.pose_graph import GraphConfig, Solution
 from mapping.pose_graph_files import write_graph
+from mapping.rounds import Registration
 from mapping.survey import correct_survey
-from mapping.survey_records import SurveyConfig
+from mapping.survey_loop import Given, State
+from mapping.survey_records import CorrectedSurvey, Round, SurveyConfig
+from mapping.textures import MatchConfig
 from perception.records import InputError
 from tests.mapping.worlds import Drift, Flight, fly, make_world
 
@@ -155,3 +160,43 @@ def test_passes_in_two_places_are_refused_and_a_long_line_of_them_is_not(
         correct_survey([strip, far])
     between = [replace(strip, easting_m=strip.easting_m + 45_000.0 * n) for n in range(10)]
     assert len(correct_survey([*between, far], config=SurveyConfig(rounds=1)).strips) == 11
+
+
+def test_a_cell_that_is_asked_for_is_not_rounded(
+    flown: list[Flight], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[float] = []
+    plain = survey_loop.compare_rounds
+
+    def told(given: Given, known: CorrectedSurvey | None) -> State:
+        seen.append(given.cell_m)
+        return plain(given, known)
+
+    monkeypatch.setattr(survey, "compare_rounds", told)
+    strips = [flown[0].strip]
+    correct_survey(strips, config=SurveyConfig(match=MatchConfig(cell_m=0.4567)))
+    correct_survey(strips)
+    assert seen[0] == 0.4567 and seen[1] == survey_check.steady(seen[1])
+
+
+ROUND = Round("soundings", 1.0, 1, 1, 1, 0, 1.0, 1.0, 1.0, 1.0, 1, 1)
+FOUND = cast(Registration, None)
+
+
+@pytest.mark.parametrize(("rounds", "expected"), [(None, [0.8, 0.3, 0.2]), (2, [0.8, 0.5])])
+def test_of_the_rounds_that_are_to_be_the_last_two_are_never_left_out(
+    rounds: int | None, expected: list[float], flown: list[Flight], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second of two was left out, for it was the second of four widths."""
+    made: list[float] = []
+
+    def noted(given: Given, state: State, part: float, *rest: object, **more: object) -> State:
+        made.append(part)
+        return replace(state, rounds=(ROUND,), found=(FOUND,))
+
+    monkeypatch.setattr(survey_loop, "_round", noted)
+    monkeypatch.setattr(survey_loop, "_needless", lambda *given: True)
+    monkeypatch.setattr(survey_loop, "_begun", lambda *given: State(cast(Solution, None)))
+    given = cast(Given, SimpleNamespace(config=SurveyConfig(rounds=rounds), cell_m=1.0))
+    survey_loop.compare_rounds(given, None)
+    assert made == expected
