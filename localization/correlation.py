@@ -30,6 +30,10 @@ _CHANCE = 45.0
 # The same over all octaves at once: of strong, smooth, real grounds wrong places had 0, right ones above
 # 1,000; patches of weak relief on a thumbnail have some 100.
 _PLAIN = 60.0
+# A survey's own map errs in long waves, and on low relief they are all that the right place leaves: few
+# independent values. Then e^12, a million places, must do, where the octaves say ten times what they say of any
+# other place and ten times the bar above. The eight wrong places of 380 that had so much had 0.0 here.
+_PLAIN_ALONE, _ALONE = 12.0, 10.0
 # Cells a side that a patch keeps in the coarse search: of 30 cells thinned by 7 nothing can be recognised.
 _FEWEST_COARSE = 12
 # Places are ranked without what a Gaussian of this part of the patch keeps, but of so many cells at least
@@ -252,12 +256,18 @@ def _distinct(matches: list[Match], apart: float) -> list[Match]:
 def _judge(matches: list[Match]) -> Matching:
     """Accept the best if chance does not explain it and no other place fits nearly as well."""
     best = matches[0]
-    margin = best.evidence - (matches[1].evidence if len(matches) > 1 else 0.0)
+    rival = matches[1].evidence if len(matches) > 1 else 0.0
+    margin = best.evidence - rival
     where = f"log likelihood ratio {best.evidence:.0f} against unrelated ground"
+    alone = best.evidence > _ALONE * max(rival, _CHANCE)
+    plain = _PLAIN_ALONE if alone else _PLAIN
     if not np.isfinite(best.covariance).all() or best.evidence < _CHANCE:
         reason = f"no place fits: {where}, {_CHANCE:g} needed"
-    elif best.plain < _PLAIN:
-        reason = f"no place fits: what the best leaves looks like ground ({best.plain:.0f}, {_PLAIN:g} needed)"
+    elif best.plain < plain:
+        reason = (
+            f"no place fits for certain: the best has a {where} (next place {rival:.0f}), but what it leaves is as "
+            f"smooth as ground: {best.plain:.0f} by all waves at once, {plain:g} needed"
+        )
     elif margin < _DISTINCT:
         reason = f"ambiguous: {where}, {margin:.1f} above the next place, {_DISTINCT:g} needed"
     else:

@@ -151,3 +151,42 @@ def check_against_map(nav: NavTable, map_elevation_m: float, relief_m: float = 0
             f"{nav.source}: {words} As they are, the bottom lies at {depth + slant * down:.4g} m "
             f"where the map has {chart:.4g} m"
         )
+
+
+# Soundings lie off the map when they are beyond all of its heights by so many spreads of its relief, and
+# so many 1-sigmas of the map and of the depth sensor's bias: no place of the map has such heights.
+_BEYOND_RELIEFS, _BEYOND_SIGMAS = 3.0, 5.0
+
+
+def off_the_map(
+    nav: NavTable, map_elevation_m: FloatArray, relief_m: float, map_sigma_m: float
+) -> str:
+    """Return a sentence where the soundings lie far above or below all of the map; empty if not.
+
+    Such soundings are no error of position: a unit, a sign or a datum is another than the map's.
+
+    Parameters
+    ----------
+    map_elevation_m : heights where the vehicle goes, any shape, NaN unknown.
+    relief_m, map_sigma_m : spread of those heights, and their 1-sigma.
+    """
+    known = map_elevation_m[np.isfinite(map_elevation_m)]
+    beams = nav.sensors.beams
+    if nav.slant_range_m.size == 0 or not known.size:
+        return ""
+    down = np.array([math.cos(b.off_nadir_rad) for b in beams]) if beams else np.ones(1)
+    sounded = -(nav.depth_m[:, None] + nav.slant_range_m * down)
+    if not np.isfinite(sounded).any():
+        return ""
+    middle = float(np.nanmedian(sounded))
+    beyond = max(middle - float(known.max()), float(known.min()) - middle)
+    allowed = _BEYOND_RELIEFS * relief_m + _BEYOND_SIGMAS * math.hypot(
+        map_sigma_m, nav.sensors.depth_bias_m
+    )
+    if not beyond > allowed:
+        return ""
+    apart = middle - float(np.median(known))
+    return (
+        f"soundings lie {abs(apart):.0f} m {'above' if apart > 0 else 'below'} the map throughout: "
+        "units, sign of depth, or datum?"
+    )

@@ -15,7 +15,7 @@ from localization.estimate import CONVERGED
 from localization.maperror import assumed_sigma
 from localization.measurements import Sensors, read_sensors
 from localization.mission import Navigation, navigate
-from localization.navchecks import check_against_map
+from localization.navchecks import check_against_map, off_the_map
 from localization.navfile import NavTable, read_nav
 from localization.navigator import Navigator, NavigatorConfig
 from localization.terrain import TerrainMap, terrain_map
@@ -78,6 +78,9 @@ def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, A
     except NoOverlapError as error:
         raise NoOverlapError(f"{nav.source} on {options.prior}: {error}") from error
     check_against_map(nav, float(np.nanmedian(terrain.height_m)), terrain.relief_m)
+    off = off_the_map(nav, terrain.height_m, terrain.relief_m, terrain.error.stated_m)
+    if off:
+        logger.warning("%s on %s: %s", nav.source, options.prior, off)
     navigator = Navigator(
         terrain,
         nav.sensors,
@@ -87,6 +90,7 @@ def locate(options: LocateOptions, out: Path, progress: Progress) -> dict[str, A
     fixes = [] if survey is None else patch_fixes(survey, terrain, nav, progress)
     result = navigate(navigator, nav, fixes, crs=prior.crs, progress=progress)
     metrics = summary(result, nav, terrain)
+    metrics["verdict"] += f"; {off}" if off else ""
     metrics["map_sigma_source"] = sigma_source
     metrics["seconds"] = round(time.perf_counter() - began, 3)
     for name, track in (

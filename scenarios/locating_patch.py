@@ -84,12 +84,20 @@ def summary(placing: Placing, prior: Grid, patch: Grid) -> dict[str, Any]:
         "protection_m": None if best is None else best.protection_m,
         "offset_easting_m": _offset(best, prior, patch, 0),
         "offset_northing_m": _offset(best, prior, patch, 1),
-        "ambiguity": placing.ambiguity,
+        "ambiguity": None if np.isnan(placing.ambiguity) else placing.ambiguity,
         "hypotheses": len(placing.places),
         "evidence": placing.places[0].evidence if placing.places else None,
         "map_carried_percent": 100.0 * placing.carried_bytes / (4.0 * prior.elevation_m.size),
-        "verdict": f"{'placed' if placing.accepted else 'no fix'}: {placing.reason}",
+        "verdict": _verdict(placing),
     }
+
+
+def _verdict(placing: Placing) -> str:
+    """One sentence for the user; without a fix it names the likeliest place all the same."""
+    if placing.accepted or not placing.places:
+        return f"{'placed' if placing.accepted else 'no fix'}: {placing.reason}"
+    best = placing.places[0]
+    return f"no fix: {placing.reason} (likeliest at {best.easting_m:.1f} E {best.northing_m:.1f} N)"
 
 
 def hypotheses_csv(placing: Placing, prior: Grid) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from localization.measurements import read_sensors
-from localization.navchecks import check_against_map
+from localization.navchecks import check_against_map, off_the_map
 from localization.navfile import nav_table, read_nav
 from perception.records import FloatArray, InputError
 
@@ -164,3 +164,27 @@ def test_beams_and_directions_must_be_as_many(tmp_path: Path) -> None:
     path.write_text("[[beam]]\nazimuth_deg = 0\noff_nadir_deg = 20\n")
     with pytest.raises(InputError, match="4 beam columns"):
         nav_table(columns_of(), read_sensors(path))
+
+
+@pytest.mark.parametrize(
+    ("sign", "raised_m", "words"),
+    [(1.0, 0.0, ""), (1.0, 30.0, ""), (-1.0, 0.0, "82 m above"), (1.0, -200.0, "200 m above")],
+)
+def test_soundings_far_from_all_of_the_map_are_told(
+    sign: float, raised_m: float, words: str
+) -> None:
+    """Depth negated raises the soundings by twice the depth; a map too deep leaves them above it."""
+    columns = columns_of()
+    columns["depth_m"] = sign * columns["depth_m"]
+    nav = nav_table(columns)
+    level = -float(
+        np.median(
+            columns_of()["depth_m"][:, None]
+            + nav.slant_range_m * np.cos(nav.sensors.beams[0].off_nadir_rad)
+        )
+    )
+    heights = (
+        level + raised_m + 8.0 * np.random.default_rng(0).standard_normal((40, 40)).clip(-2, 2)
+    )
+    found = off_the_map(nav, heights, 8.0, 0.3)
+    assert (words in found) if words else not found

@@ -108,6 +108,26 @@ def test_ground_that_the_map_lacks_is_no_fix() -> None:
     assert "no place fits" in placing.reason
 
 
+def test_a_survey_s_map_of_low_relief_that_errs_in_long_waves_is_placed() -> None:
+    """All that the right place leaves is smooth, as ground is; no other place comes near, and it is told apart."""
+    rng = np.random.default_rng(13)
+    floor = ndimage.gaussian_filter(rng.standard_normal((120, 140)), 2.0) * 4.0
+    drift = ndimage.gaussian_filter(rng.standard_normal((90, 90)), 10.0) * 3.0
+    whole = Grid(floor, 0.0, 120.0, 1.0)
+    placing = place_on_raster(whole, Grid(floor[20:110, 30:120] + drift, 0.0, 90.0, 1.0), 0.0)
+    best = placing.places[0]
+    assert placing.accepted, placing.reason
+    assert np.hypot(best.easting_m - 75.0, best.northing_m - 55.0) < 1.0
+
+
+def test_smooth_steep_ground_that_the_map_lacks_is_no_fix_whatever_its_octaves_say() -> None:
+    other = np.random.default_rng(3).standard_normal((61, 61)).cumsum(axis=0).cumsum(axis=1)
+    placing = place_on_raster(
+        prior(), Grid(20.0 * ndimage.gaussian_filter(other, 6.0), 0.0, 0.0, 5.0), TURN
+    )
+    assert not placing.accepted
+
+
 def test_flat_ground_is_no_fix() -> None:
     flat = Grid(0.2 * np.random.default_rng(4).standard_normal((60, 60)), 0.0, 0.0, 5.0)
     assert not place_on_raster(prior(), flat, TURN).accepted
