@@ -8,7 +8,9 @@ at z_foot under a hill and z_end at its shadow's end, or at z_rim where the ray 
     hill:    dH = z_end Rs / (Rs + Ls) - z_foot
     crater:  dD = z_end - z_rim (Rs + Ls) / Rs
 
-The floor under an object is the plane through the map's heights around it. The map errs too: the correction counts by its variance against that of the floor as the pass knew it.
+The floor under an object is the plane through the map's heights around it. The map errs too, there, at the end and below
+the sonar, which counts (1 - Rs / (Rs + Ls)) times for a hill and ((Rs + Ls) / Rs - 1) times for a crater: the correction
+counts by its variance against that of the floor as the pass knew it.
 """
 
 from __future__ import annotations
@@ -47,9 +49,11 @@ def on_floor(
     correction = np.where(
         hill, floors.end_m * share - floors.foot_m, floors.inside_m - floors.rim_m / share
     )
-    # A crater's floor, level or leaning, counts by what the ray falls from rim to end.
+    # A crater's correction is (Rs + Ls) / Rs - 1 times what the plane rises or falls from its middle to the sonar's place.
     variance = np.where(
-        hill, floors.end_m2 * share**2 + floors.foot_m2, floors.foot_m2 * (1 / share - 1) ** 2
+        hill,
+        floors.end_m2 * share**2 + floors.foot_m2 + floors.below_m2 * (1 - share) ** 2,
+        (floors.foot_m2 + floors.below_m2 + floors.fall_m2) * (1 / share - 1) ** 2,
     )
     before = np.square(table.floor_sigma_m)
     known = floors.known
@@ -75,7 +79,8 @@ class _Floors:
     """The map's floor over that below the sonar, (n,) each: `end_m` at the shadow's end by the map, the others by the
     plane around the footprint: under its middle, where the ray grazes it, and at the shadow's end.
 
-    `foot_m2`, `end_m2`: variances. `known`: whether the map holds them.
+    `foot_m2`, `end_m2`, `below_m2`: variances of these and of the floor below the sonar; `fall_m2` of what the plane
+    falls from the footprint to there. `known`: whether the map holds them.
     """
 
     foot_m: FloatArray
@@ -84,6 +89,8 @@ class _Floors:
     end_m: FloatArray
     foot_m2: FloatArray
     end_m2: FloatArray
+    below_m2: FloatArray
+    fall_m2: FloatArray
     known: BoolArray
 
 
@@ -109,7 +116,7 @@ def _floors(
         reach = ground_range(
             last, np.maximum(table.drop_m - np.nan_to_num(end), 0.1 * table.drop_m)
         )
-    plane, plane_m2, known = _planes(table, grid, sigma, bearing)
+    plane, (plane_m2, lean_m2), known = _planes(table, grid, sigma, bearing)
     foot, lean = plane[:, 0] - below, plane[:, 1]
     rim = ground_range(table.slant_range_m, table.drop_m)
     inside = rim * last / np.maximum(table.slant_range_m, 1e-9)
@@ -120,16 +127,19 @@ def _floors(
         end_m=end,
         foot_m2=plane_m2,
         end_m2=np.square(sigma.sample(*place)),
+        below_m2=np.square(sigma.sample(sonar_east_m, sonar_north_m)),
+        fall_m2=lean_m2 * np.square(away),
         known=known & np.isfinite(below) & np.isfinite(end),
     )
 
 
 def _planes(
     table: ObjectTable, grid: Grid, sigma: Grid, bearing: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the plane around each footprint: height at its middle and rise outward (n, 2), variance, and where known."""
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray], BoolArray]:
+    """Return the plane around each footprint: height at its middle and rise outward (n, 2), variances, and where known."""
     radius = _OUT * np.maximum(table.half_across_m, table.half_along_m) + grid.cell_m
-    plane, variance = np.full((len(table), 2), np.nan), np.full(len(table), np.nan)
+    plane = np.full((len(table), 2), np.nan)
+    variance, lean = np.full(len(table), np.nan), np.full(len(table), np.nan)
     around = np.arange(_RING) * 2 * np.pi / _RING
     # Outward and beside, in radii; the sector of the shadow is not floor seen.
     outward, beside = np.cos(around), np.sin(around)
@@ -145,4 +155,7 @@ def _planes(
             plane[i] = found[0], found[1] / radius[i]
             # Errors of a map run over many cells: those around one object err together.
             variance[i] = np.mean(np.square(spread[seen]))
-    return plane, variance, np.isfinite(variance)
+            # A common error tilts nothing; what may tilt the plane is taken at its worst, from place to place.
+            part = np.linalg.inv(terms[seen].T @ terms[seen])[1, 1]
+            lean[i] = variance[i] * part / radius[i] ** 2
+    return plane, (variance, lean), np.isfinite(variance)

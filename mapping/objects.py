@@ -45,7 +45,8 @@ class MergedObjects:
     `radius_m` is the footprint's, NaN where no look has one; `least` marks heights that are only the least that open
     shadows prove. `disputed` marks an object beside which another pass saw something else: the other kind, or a height
     that differs by more than the sigmas allow. Both are kept. `look` gives the object of each look of
-    the tables, one after the other.
+    the tables, one after the other. `overruled` marks a least height at whose place other passes saw plain ground
+    (`mapping.overruled`); no merging does so by itself.
     """
 
     easting_m: FloatArray
@@ -60,13 +61,16 @@ class MergedObjects:
     look: IntArray
     radius_m: FloatArray
     least: npt.NDArray[np.bool_]
+    overruled: npt.NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.kind)
 
 
 def merge_objects(
-    tables: Sequence[Looks], position_sigma_m: float | Sequence[float] = 0.5
+    tables: Sequence[Looks],
+    position_sigma_m: float | Sequence[float] = 0.5,
+    one_floor: bool = False,
 ) -> MergedObjects:
     """Merge the looks of several passes.
 
@@ -79,6 +83,8 @@ def merge_objects(
     Parameters
     ----------
     position_sigma_m : 1-sigma of each pass's track, one for all or one per table.
+    one_floor : whether the looks' heights are above the floor of one map (`mapping.object_floors`): its error,
+        the tables' `floor_sigma_m`, is then common to them and no number of passes makes it less.
     """
     position = np.broadcast_to(np.asarray(position_sigma_m, float), (len(tables),))
     owner = np.repeat(np.arange(len(tables)), [len(t.height_m) for t in tables])
@@ -88,9 +94,12 @@ def merge_objects(
     kind = np.array([k for t in tables for k in t.kind], dtype=object)
     sigma = np.maximum(np.nan_to_num(sigma, nan=1.0), 1e-3)
     least, radius = _optional(tables, "lower_bound", bool), _radius(tables)
+    floor = np.minimum(_optional(tables, "floor_sigma_m", float) * one_floor, sigma)
     where = np.hypot(_CENTRE_SIGMA_M, position[owner]) if len(owner) else np.zeros(0)
     group, rivals = _group(points, where, owner, kind, height, sigma, least)
-    return _summarise(points, where, owner, kind, height, sigma, group, rivals, least, radius)
+    return _summarise(
+        points, where, owner, kind, height, sigma, floor, group, rivals, least, radius
+    )
 
 
 def _column(tables: Sequence[Looks], name: str) -> FloatArray:
@@ -137,8 +146,8 @@ def _group(
 
 def _summarise(
     points: FloatArray, where: FloatArray, owner: IntArray, kind: npt.NDArray[Any], height: FloatArray,
-    sigma: FloatArray, group: IntArray, rivals: Sequence[tuple[int, int]], least: npt.NDArray[np.bool_],
-    radius: FloatArray,
+    sigma: FloatArray, floor: FloatArray, group: IntArray, rivals: Sequence[tuple[int, int]],
+    least: npt.NDArray[np.bool_], radius: FloatArray,
 ) -> MergedObjects:  # fmt: skip
     _, look = np.unique(group, return_inverse=True)
     n = int(look.max()) + 1 if len(look) else 0
@@ -148,7 +157,9 @@ def _summarise(
     open_only = np.bincount(look, ~least, minlength=n) == 0
     counts = ~least | _greatest(height, look, open_only)
     told = look[counts]
-    h, h_sigma = _weighted(height[counts], sigma[counts], told, n, np.bincount(told, minlength=n))
+    h, h_sigma = _weighted(
+        height[counts], sigma[counts], told, n, np.bincount(told, minlength=n), floor[counts]
+    )
     widest = np.full(n, -np.inf)
     np.fmax.at(widest, look, radius)
     east, e_sigma = _weighted(points[:, 0], where, look, n, looks)
@@ -171,6 +182,7 @@ def _summarise(
         look=look,
         radius_m=np.where(np.isfinite(widest), widest, np.nan),
         least=open_only,
+        overruled=np.zeros(n, bool),
     )
 
 
@@ -202,14 +214,21 @@ def _radius(tables: Sequence[Looks]) -> FloatArray:
 
 
 def _weighted(
-    values: FloatArray, sigma: FloatArray, group: IntArray, n: int, looks: IntArray
-) -> tuple[FloatArray, FloatArray]:
+    values: FloatArray, sigma: FloatArray, group: IntArray, n: int, looks: IntArray,
+    common: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return the means of groups (n,) and their sigma; `common` is the part of each sigma that a group shares."""
     weight = 1.0 / sigma**2
     total = np.bincount(group, weight, minlength=n)
     mean = np.bincount(group, weight * values, minlength=n) / total
     chi2 = np.bincount(group, weight * (values - mean[group]) ** 2, minlength=n)
     growth = np.maximum(chi2 / np.maximum(looks - 1, 1), 1.0)
-    return mean, np.sqrt(growth / total)
+    if common is None:
+        return mean, np.sqrt(growth / total)
+    share = weight / total[group]
+    own = np.bincount(group, share**2 * (sigma**2 - common**2), minlength=n)
+    together = np.bincount(group, share * common, minlength=n)
+    return mean, np.sqrt(growth * own + together**2)
 
 
 def write_objects(path: Path, objects: MergedObjects, crs: str) -> None:
@@ -227,5 +246,6 @@ def write_objects(path: Path, objects: MergedObjects, crs: str) -> None:
         "disputed": objects.disputed,
         "radius_m": objects.radius_m,
         "bound": np.where(objects.least, "lower", "").astype(object),
+        "overruled": objects.overruled,
     }
     write_layer(path, points, columns, crs, "Point")

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mapping.object_floors import on_floor
+from mapping.objects import merge_objects
 from perception.object_table import ObjectRow, ObjectTable
 from perception.records import FloatArray, Grid
 from perception.shadows import crater_depth, hill_height
@@ -96,3 +97,49 @@ def test_open_shadows_and_unmapped_ground_leave_an_object_alone() -> None:
         )
     bare = replace(_map(_bent, 0.01), sigma_m=None)
     assert on_floor(table, bare, np.zeros(1), np.zeros(1)) is table
+
+
+@pytest.mark.parametrize("kind", ["hill", "crater"])
+def test_the_errors_of_a_maps_floor_stay_within_the_claimed_sigma(kind: str) -> None:
+    """Maps that err from place to place, each told its sigma: by what the heights scatter, the table says so."""
+    rng, sigma_m, heights, claimed = np.random.default_rng(3), 0.2, [], []
+    # A pass that knows nothing of its floor: all of it is the map's.
+    table = replace(_seen(kind, _bent, 1), floor_sigma_m=np.array([50.0]))
+    table = replace(table, sigma_m=np.array([50.0]), height_m=table.height_m + 5.0)
+    true = _map(_bent, sigma_m)
+    east = np.arange(true.shape[1])[None, :] * true.cell_m
+    for _ in range(300):
+        # Waves of some metres: alike around one object, independent of what is below the sonar and at the end.
+        wave = sum(
+            sigma_m / np.sqrt(4) * np.sqrt(2) * np.sin(east / k + rng.uniform(0, 2 * np.pi))
+            for k in rng.uniform(3.0, 6.0, 4)
+        )
+        noisy = replace(true, elevation_m=true.elevation_m + wave)
+        mended = on_floor(table, noisy, np.zeros(1), np.zeros(1))
+        heights.append(mended.height_m[0])
+        claimed.append(mended.floor_sigma_m[0])
+    scatter = np.std(heights) / np.mean(claimed)
+    assert 0.3 < scatter < 1.15, scatter
+
+
+def test_what_lies_below_the_sonar_counts_in_the_sigma() -> None:
+    table = replace(
+        _seen("hill", _bent, 1), floor_sigma_m=np.array([50.0]), sigma_m=np.array([60.0])
+    )
+    good = _map(_bent, 0.01)
+    assert good.sigma_m is not None
+    poor = good.sigma_m.copy()
+    poor[:, np.abs(good.centres()[0]) < 2.0] = 1.0
+    share = float(table.slant_range_m[0] / (table.slant_range_m + table.shadow_length_m)[0])
+    mended = on_floor(table, replace(good, sigma_m=poor), np.zeros(1), np.zeros(1))
+    assert mended.floor_sigma_m[0] == pytest.approx(1.0 - share, rel=0.1)
+
+
+def test_passes_over_one_map_share_its_error() -> None:
+    one = replace(_seen("hill", _bent, 1), sigma_m=np.array([0.5]), floor_sigma_m=np.array([0.4]))
+    tables = [one, replace(one, pass_index=np.array([1])), replace(one, pass_index=np.array([2]))]
+    apart, shared = merge_objects(tables), merge_objects(tables, one_floor=True)
+    assert len(shared) == 1
+    assert_allclose(shared.height_m, apart.height_m)
+    assert apart.sigma_m[0] == pytest.approx(0.5 / np.sqrt(3))
+    assert shared.sigma_m[0] == pytest.approx(np.sqrt(0.3**2 / 3 + 0.4**2))
