@@ -130,7 +130,7 @@ class IncrementalSurvey:
             height_m=found.height_m,
             height_sigma_m=found.height_sigma_m,
         )
-        return with_range_scale(updated, survey.keyframes, survey.links, survey.ties, survey.steps)
+        return with_range_scale(updated, survey.keyframes, survey.links, survey.ties)
 
 
 def _used(factors: Sequence[_Factor], used: BoolArray) -> list[_Factor]:

@@ -132,7 +132,9 @@ class Solution:
     error_before, error_after : the graph's error (half a chi-square) over what was used.
     indeterminate, worsened : the graph does not determine the answer; the answer is no better.
     config : what was assumed.
-    root : what all covariances can be had from; None where the graph is indeterminate or was not solved as a whole.
+    range_effect_m : (k, 2) what 1-sigma of `GraphConfig.range_scale` does to `correction_m`, whose square is part of
+        `covariance_m2`; None where it is not.
+    root : what all other covariances can be had from; None where the graph is indeterminate or was not solved as a whole.
     """
 
     correction_m: FloatArray
@@ -149,6 +151,7 @@ class Solution:
     indeterminate: bool
     worsened: bool
     config: GraphConfig
+    range_effect_m: FloatArray | None = None
     root: Root | None = field(default=None, repr=False, compare=False)
 
 

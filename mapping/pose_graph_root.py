@@ -60,11 +60,6 @@ class Root:
         begin = np.concatenate([[0], np.cumsum(length)])
         return cls(begin, np.concatenate(columns), np.concatenate(values), place, size)
 
-    @property
-    def half_log_det(self) -> float:
-        """Half the log-determinant of the information."""
-        return float(np.log(np.abs(self.value[self.begin[:-1]])).sum())
-
     def positions(self, keys: Iterable[int]) -> IntArray:
         """Return (k, d) the positions of variables of one size."""
         first = [(self.place[key], self.size[key]) for key in keys]
@@ -87,15 +82,18 @@ class Root:
     def _inverse(self) -> FloatArray:
         return _selected_inverse(self.begin, self.column, self.value)
 
-    def draws(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Return (n, number) draws of all unknowns' errors, by position."""
-        white = rng.normal(size=(len(self.begin) - 1, number))
-        _back(self.begin, self.column, self.value, white)
-        return white
+    def __len__(self) -> int:
+        return len(self.begin) - 1
+
+    def draws(self, white: FloatArray) -> FloatArray:
+        """Return (n, m) draws of all unknowns' errors, by position, made of white noise (n, m)."""
+        drawn = np.array(white, float)
+        _back(self.begin, self.column, self.value, drawn)
+        return drawn
 
     def columns(self, positions: IntArray) -> FloatArray:
         """Return (n, len(positions)) whole columns of the covariance."""
-        unit = np.zeros((len(self.begin) - 1, len(positions)))
+        unit = np.zeros((len(self), len(positions)))
         unit[positions, np.arange(len(positions))] = 1.0
         _forward(self.begin, self.column, self.value, unit)
         _back(self.begin, self.column, self.value, unit)

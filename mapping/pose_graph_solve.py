@@ -9,7 +9,7 @@ registrations weighs these factors anew and eliminates again, as often as it tak
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -94,32 +94,43 @@ class LinearGraph:
         return graph
 
     def optimum(self, weight: FloatArray) -> Any:
-        """Return the answer under these weights."""
-        return self.graph(weight).eliminateMultifrontal(self._ordering).optimize()
-
-    def misfit(self, values: Any) -> FloatArray:
-        """Return chi-square of each doubtful factor, unweighted."""
-        return np.array([2.0 * f.error(values) for f in self.doubtful]) / self._weight
-
-    def net(self, graph: Any) -> tuple[Any, Any]:
-        """Return the Bayes net of a graph of these factors and its answer, by QR where Cholesky loses it.
+        """Return the answer under these weights.
 
         Raises
         ------
         RuntimeError
             The graph does not determine its unknowns.
         """
+        graph = self.graph(weight)
+        return self._eliminated(graph, graph.eliminateMultifrontal)[1]
+
+    def misfit(self, values: Any) -> FloatArray:
+        """Return chi-square of each doubtful factor, unweighted."""
+        return np.array([2.0 * f.error(values) for f in self.doubtful]) / self._weight
+
+    def net(self, graph: Any) -> tuple[Any, Any]:
+        """Return the Bayes net of a graph of these factors and its answer.
+
+        Raises
+        ------
+        RuntimeError
+            The graph does not determine its unknowns.
+        """
+        return self._eliminated(graph, graph.eliminateSequential)
+
+    def _eliminated(self, graph: Any, eliminate: Callable[..., Any]) -> tuple[Any, Any]:
+        """Return what is left of a graph and its answer, by QR where Cholesky loses it."""
         try:
-            net = graph.eliminateSequential(self._ordering)
-            values = net.optimize()
+            left_over = eliminate(self._ordering)
+            values = left_over.optimize()
             left, start = graph.gradient(values).norm(), graph.gradientAtZero().norm()
             if left <= _LEAST_GAIN * start + 1e-9:
-                return net, values
+                return left_over, values
             logger.info("pose graph: gradient %.1e of %.1e left, solved by QR", left, start)
         except RuntimeError as error:
             logger.info("pose graph: solved by QR: %s", str(error).strip().splitlines()[0])
-        net = graph.eliminateSequential(self._ordering, gtsam.EliminateQR)
-        return net, net.optimize()
+        left_over = eliminate(self._ordering, gtsam.EliminateQR)
+        return left_over, left_over.optimize()
 
 
 def _way_factors(keyframes: Keyframes, config: GraphConfig) -> list[Any]:
@@ -191,6 +202,11 @@ def consistent(graph: LinearGraph, config: GraphConfig) -> BoolArray:
         if np.minimum(weight, 1.0 - weight).max() < _DECIDED:
             break
         mu *= _SHARPER
+    else:
+        logger.warning(
+            "pose graph: %d registrations, height steps or fixes undecided after %d steps; the likelier is taken",
+            ((weight > _DECIDED) & (weight < 1.0 - _DECIDED)).sum(), _MOST_STEPS,
+        )  # fmt: skip
     return weight > 0.5
 
 
@@ -215,14 +231,14 @@ def solve(
     used = np.ones(len(linear.doubtful), bool)
     if decided is not None:
         used = np.concatenate([decided.link_used, decided.step_used, decided.fix_used])
-    elif robust and len(used):
-        used = consistent(linear, config)
-    graph = linear.graph(used.astype(float))
     try:
+        if decided is None and robust and len(used):
+            used = consistent(linear, config)
+        graph = linear.graph(used.astype(float))
         net, values = linear.net(graph)
     except RuntimeError as error:
         logger.warning("the pose graph is indeterminate: %s", str(error).strip().splitlines()[0])
-        net, values = None, None
+        graph = net = values = None
     n_links = len(links)
     solution = _solution(
         keyframes, config, graph, net, values, used[:n_links],
@@ -240,7 +256,6 @@ def with_range_scale(
     keyframes: Keyframes,
     links: Sequence[Link],
     fixes: Sequence[KeyframeFix],
-    steps: Sequence[HeightStep] = (),
 ) -> Solution:
     """Return a solution whose covariances hold what a range scale that all passes have in common would do to it.
 
@@ -251,7 +266,7 @@ def with_range_scale(
 
     Parameters
     ----------
-    links, fixes, steps : of the solution, in its order.
+    links, fixes : of the solution, in its order.
     """
     config = solution.config
     if solution.root is None or not config.range_scale:
@@ -268,10 +283,18 @@ def with_range_scale(
     ]
     # Heights have no part in it.
     linear = LinearGraph(keyframes, pulls, still, config)
-    values = linear.optimum(np.ones(len(linear.doubtful)))
+    try:
+        values = linear.optimum(np.ones(len(linear.doubtful)))
+    except RuntimeError as error:
+        logger.warning(
+            "a range scale in common is left out of the claimed covariances: %s",
+            str(error).strip().splitlines()[0],
+        )
+        return solution
     change = config.range_scale * np.array([values.at(E(k)) for k in range(len(keyframes))])
     spread = change[:, :, None] * change[:, None, :]
-    return replace(solution, covariance_m2=solution.covariance_m2 + spread)
+    wider = solution.covariance_m2 + spread
+    return replace(solution, covariance_m2=wider, range_effect_m=change)
 
 
 def _range_effect(keyframes: Keyframes, link: Link) -> FloatArray:

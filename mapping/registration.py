@@ -161,7 +161,8 @@ def _towards(side: int, heading_rad: float) -> tuple[float, float]:
     return sign * float(np.cos(heading)), -sign * float(np.sin(heading))
 
 
-@lru_cache(maxsize=256)
+# Some headings are looked at at a time; 0.6 MB each.
+@lru_cache(maxsize=32)
 def _gains(size: int, u: tuple[float, float], v: tuple[float, float]) -> dict[str, FloatArray]:
     """Return which waves two looks towards `u` and `v` see alike ("echo") and which with opposite sign."""
     east, north = wave_directions(size)

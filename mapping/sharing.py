@@ -16,7 +16,7 @@ import numpy as np
 
 from mapping.keyframes import KeyframeFix, Keyframes
 from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution
-from mapping.pose_graph_solve import log_evidence, solve, with_range_scale
+from mapping.pose_graph_solve import LinearGraph, consistent, log_evidence, solve, with_range_scale
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ def solve_shared(
     covariances hold what a range scale in common adds.
     """
     solution = _most_evident(keyframes, links, fixes, config, steps)
-    return with_range_scale(solution, keyframes, links, fixes, steps)
+    return with_range_scale(solution, keyframes, links, fixes)
 
 
 def _most_evident(
@@ -91,8 +91,22 @@ def _most_evident(
             best, most = shared, found
     if best == config.shared and config == first.config:
         return first
+    config = replace(config, shared=best)
     # The size of height offsets has no say in the plane, and smaller ones clear no step that was doubted.
     same = best == first.config.shared and config.height_m <= first.config.height_m
-    decided = first if same else None
-    config = replace(config, shared=best)
+    decided = _steps_doubted(first, keyframes, steps, config) if same else None
     return solve(keyframes, links, fixes, config, steps=steps, decided=decided)
+
+
+def _steps_doubted(
+    first: Solution, keyframes: Keyframes, steps: Sequence[HeightStep], config: GraphConfig
+) -> Solution:
+    """Return what was decided of registrations and fixes, with the steps that it believed weighed anew.
+
+    What large offsets explain smaller ones may not. Heights hang on nothing but steps, so these decide alone.
+    """
+    believed = np.flatnonzero(first.step_used).tolist()
+    linear = LinearGraph(keyframes, (), (), config, [steps[i] for i in believed])
+    used = first.step_used.copy()
+    used[believed] = consistent(linear, config)
+    return replace(first, step_used=used)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from mapping.keyframes import choose_keyframes, tie_fixes
 from mapping.pose_graph import GraphConfig, build
 from mapping.pose_graph_relative import relative_covariance
 from mapping.pose_graph_solve import solve
+from mapping.sharing import solve_shared
 from perception.records import FloatArray
 from tests.mapping.test_pose_graph import end_fixes, flights, true_links
 
@@ -48,9 +51,48 @@ def test_it_is_what_the_joint_marginals_of_both_say() -> None:
 
 
 def test_of_many_keyframes_draws_tell_it_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    """256 draws know a variance to 9 %, 1-sigma; five of those are allowed to the worst of forty pairs."""
+    """254 draws know a variance to 9 %, 1-sigma; five of those are allowed to the worst of forty pairs."""
     monkeypatch.setattr(relative, "_MOST_COLUMNS", 6)
     ours, theirs = both_ways(40)
     trace = np.trace(ours, axis1=1, axis2=2), np.trace(theirs, axis1=1, axis2=2)
     np.testing.assert_allclose(trace[0], trace[1], rtol=0.45, atol=1e-12)
     assert abs(np.median(trace[0] / np.maximum(trace[1], 1e-12)) - 1.0) < 0.15
+
+
+def test_noise_that_is_not_random_is_white() -> None:
+    noise = relative._white(40_000)
+    np.testing.assert_allclose((noise**2).mean(axis=1), 1.0)
+    assert len(np.unique(noise.round(6), axis=0)) == len(noise)
+    near = noise[: relative._WAVES]
+    np.testing.assert_allclose(near @ near.T / noise.shape[1], np.eye(len(near)), atol=1e-12)
+    pairs = np.random.default_rng(0).permutation(len(noise)).reshape(-1, 2)
+    alike = (noise[pairs[:, 0]] * noise[pairs[:, 1]]).mean(axis=1)
+    assert np.sqrt((alike**2).mean()) < 1.1 * noise.shape[1] ** -0.5
+    assert np.abs(alike).max() <= 2.0 * relative._WAVES**-0.5
+
+
+def test_columns_and_draws_hold_the_same_of_a_range_scale_in_common(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of a scale that all but makes the claim, draws know nothing to err in: both agree to 1 %."""
+    rng = np.random.default_rng(4)
+    flown = flights(rng)
+    strips = [f.strip for f in flown]
+    keyframes = choose_keyframes(strips, 15.0)
+    fixes = tie_fixes(end_fixes(flown, rng), strips, keyframes, 4.0)
+    links = true_links(flown, keyframes, rng)
+    solution = solve_shared(keyframes, links, fixes, GraphConfig(range_scale=1.0))
+    # Far from each other, where the scale drew them apart.
+    pairs = rng.integers(0, len(keyframes), (40, 2))
+    effect = solution.range_effect_m
+    assert effect is not None
+    far = np.hypot(*(effect[pairs[:, 0]] - effect[pairs[:, 1]]).T) > 20.0
+    pairs = pairs[far]
+    assert len(pairs) > 5
+    plain = replace(solution, range_effect_m=None)
+    columns, without = (relative_covariance(s, pairs) for s in (solution, plain))
+    monkeypatch.setattr(relative, "_MOST_COLUMNS", 1)
+    draws = relative_covariance(solution, pairs)
+    trace = [np.trace(c, axis1=1, axis2=2) for c in (columns, draws, without)]
+    assert (trace[2] < 0.05 * trace[0]).all()
+    np.testing.assert_allclose(trace[0], trace[1], rtol=0.02)

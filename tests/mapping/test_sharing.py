@@ -72,3 +72,21 @@ def test_the_size_of_height_offsets_is_that_of_the_crossings(
 
 def test_without_crossings_the_configured_size_stands() -> None:
     assert height_size([], 3, GraphConfig(height_m=0.2)) == 0.2
+
+
+def test_a_step_that_only_large_offsets_explain_is_doubted_when_small_ones_are_found() -> None:
+    """Five passes agree to a centimetre; what one crossing says of the sixth is then no offset of its own."""
+    rng = np.random.default_rng(8)
+    keyframes = choose_keyframes([f.strip for f in flights(rng)], 30.0)
+    ties = [KeyframeFix(k, np.zeros(2), 0.01 * np.eye(2)) for k in (0, len(keyframes) - 1)]
+    steps = [HeightStep(i, j, 0.0, 0.02) for i in range(5) for j in range(i + 1, 5)]
+    steps.append(HeightStep(0, 5, 0.17, 0.05))
+    config = GraphConfig(drift_m_per_sqrt_km=0.5, shared=0.995)
+    first = solve(keyframes, (), ties, config, steps=steps)
+    assert first.step_used.all() and height_size(steps, 6, config) < config.height_m
+    shared = solve_shared(keyframes, (), ties, config, steps)
+    assert shared.config.height_m < config.height_m
+    alone = solve(keyframes, (), ties, shared.config, steps=steps)
+    np.testing.assert_array_equal(shared.step_used, alone.step_used)
+    assert shared.step_used[:-1].all() and not shared.step_used[-1]
+    assert abs(shared.height_m[5]) < 0.01
