@@ -19,6 +19,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from mapping.cog import RASTER_ERRORS, Statistics
+from mapping.raster_checks import no_heights, undeclared_rim
 from perception.files import existing_file, whole_file
 from perception.records import FloatArray, Grid, InputError
 
@@ -26,15 +27,12 @@ logger = logging.getLogger(__name__)
 
 _SIGMA_NAMES = ("sigma", "uncertainty", "std", "stddev", "standard deviation")
 _ELEVATION_NAMES = ("elevation", "bathymetry", "height", "z", "topo", "depth")
-# What makers write for "no data" and forget to declare; no sea floor stands at these to the digit.
-_SENTINELS = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0)
-# No height, whatever it stands for: makers fill with 1e20 or the largest float. (An odd datum may add millions.)
-_IMPOSSIBLE_M = 1e9
 # Metres in a unit of height; the survey foot differs from the foot by two parts in a million.
 _UNITS_M = {
     "ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "us-ft": 1200 / 3937, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937,
     "fathom": 1.8288, "fathoms": 1.8288, "cm": 0.01, "centimetre": 0.01, "centimeter": 0.01, "mm": 0.001, "dm": 0.1,
-    "km": 1000.0,
+    "km": 1000.0, "yd": 0.9144, "yard": 0.9144, "yards": 0.9144,
+    "m": 1.0, "metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0,
 }  # fmt: skip
 
 
@@ -70,6 +68,11 @@ def open_map(path: Path, sigma_m: float | None = None) -> Iterator[OpenMap]:
             with rasterio.open(_main_subdataset(path)) as source:
                 yield _opened(source, path, sigma_m)
     except RasterioError as error:
+        if str(error).startswith("Read failed"):
+            raise InputError(
+                f"{path}: is cut short or damaged: its head is a raster's, but cells cannot be read "
+                f"({error.__cause__ or error}); fetch or make it again"
+            ) from error
         raise InputError(
             f"{path}: GDAL cannot read it as a raster ({error}); "
             "give a GeoTIFF, BAG, NetCDF or ASC grid"
@@ -119,6 +122,14 @@ class OpenMap:
                 f"{self.path}: band {self.elevation_band} holds no height at all "
                 "(every cell is nodata or NaN)"
             )
+        rim = undeclared_rim(grid.elevation_m)
+        if rim is not None:
+            value = (-rim[0] if self.down else rim[0]) / self.unit_m + 0.0
+            self._tell_once(
+                "rim",
+                f"{rim[1]:,} cells hold exactly {value:g}, far from all the others, and fill its rim: is that "
+                f"no data? Declare it: gdal_edit.py -a_nodata {value:g} {self.path.name}",
+            )
         return replace(grid, sigma_m=_known(grid.sigma_m), count=_known(grid.count))
 
     def read(self, rows: slice | None = None, cols: slice | None = None) -> Grid:
@@ -167,9 +178,8 @@ class OpenMap:
 
     def _without_sentinels(self, elevation_m: FloatArray) -> FloatArray:
         """Return heights with NaN for what stands for no data without being declared as such."""
-        wrong = np.abs(elevation_m) > _IMPOSSIBLE_M
-        if self.source.nodatavals[self.elevation_band - 1] is None:
-            wrong |= np.isin(elevation_m, np.array(_SENTINELS) * self.unit_m)
+        declared = self.source.nodatavals[self.elevation_band - 1] is not None
+        wrong = no_heights(elevation_m, declared, self.unit_m)
         if not wrong.any():
             return elevation_m
         values = ", ".join(f"{v / self.unit_m:g}" for v in np.unique(elevation_m[wrong])[:3])
@@ -229,6 +239,8 @@ def _unit_of_height(source: Any, band: int, path: Path) -> float:
     tags = {k.rsplit("#", 1)[-1].lower(): v for k, v in source.tags(band).items()}
     name = str(source.units[band - 1] or tags.get("units", "") or tags.get("unittype", "")).strip()
     unit_m = _UNITS_M.get(name.lower().replace("_", " "), 1.0)
+    if name and name.lower().replace("_", " ") not in _UNITS_M:
+        logger.warning("%s: its unit of height, %r, is not known: read as metres", path, name)
     if not name and source.crs and source.crs.to_wkt().startswith("COMPD"):
         axis = CRS.from_wkt(source.crs.to_wkt()).sub_crs_list[-1].axis_info[0]
         name, unit_m = axis.unit_name, axis.unit_conversion_factor

@@ -79,6 +79,52 @@ def test_a_value_for_no_data_that_the_file_does_not_declare_is_no_height(
     assert len(caplog.messages) == 1 and "taken for no data" in caplog.text
 
 
+def test_a_usual_number_for_no_data_among_heights_of_its_size_is_a_height(tmp_path: Path) -> None:
+    """In centimetres 9,999 is a depth of 99.99 m: among depths of a hundred metres it is one."""
+    values = -10_000.0 + np.random.default_rng(0).integers(-300, 300, (10, 12))
+    values[2:4, 3] = -9999.0
+    path = write_raw(tmp_path / "cm.tif", values, NORTH_UP, "EPSG:32630")
+    with rasterio.open(path, "r+") as target:
+        target.set_band_unit(1, "cm")
+    np.testing.assert_allclose(read_map(path).elevation_m[2:4, 3], -99.99)
+    shallow = write_raw(
+        tmp_path / "s.tif", np.where(values == -9999.0, values, values / 8), NORTH_UP, "EPSG:32630"
+    )
+    with rasterio.open(shallow, "r+") as target:
+        target.set_band_unit(1, "cm")
+    assert np.isnan(read_map(shallow).elevation_m[2:4, 3]).all()
+
+
+@pytest.mark.parametrize("value", [0.0, 100.0])
+def test_a_rim_of_one_value_far_from_the_ground_is_told_and_kept(
+    tmp_path: Path, value: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    values = -40.0 + np.random.default_rng(0).normal(size=(30, 40))
+    whole = read_map(write_raw(tmp_path / "whole.tif", values, NORTH_UP, "EPSG:32630"))
+    assert np.isfinite(whole.elevation_m).all() and not caplog.messages
+    values[:3] = values[:, :4] = value
+    grid = read_map(write_raw(tmp_path / "m.tif", values, NORTH_UP, "EPSG:32630"))
+    assert (grid.elevation_m == value).sum() == 3 * 40 + 27 * 4
+    assert f"228 cells hold exactly {value:g}" in caplog.text
+    assert f"-a_nodata {value:g} m.tif" in caplog.text
+
+
+def test_an_unknown_unit_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_raw(tmp_path / "m.tif", np.full((4, 5), -100.0), NORTH_UP, "EPSG:32630")
+    with rasterio.open(path, "r+") as target:
+        target.set_band_unit(1, "cubits")
+    np.testing.assert_allclose(read_map(path).elevation_m, -100.0)
+    assert "'cubits', is not known: read as metres" in caplog.text
+
+
+def test_a_raster_cut_short_is_told_as_such(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).normal(size=(300, 300))
+    path = write_raw(tmp_path / "m.tif", values, NORTH_UP, "EPSG:32630")
+    path.write_bytes(path.read_bytes()[:100_000])
+    with pytest.raises(InputError, match="cut short or damaged"):
+        read_map(path)
+
+
 @pytest.mark.parametrize(
     ("unit", "crs", "metres"),
     [
