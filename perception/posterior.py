@@ -269,7 +269,10 @@ class Problem:
             betas.append(following / rs)
             add_times(s, betas[-1], p)
             p, rs = s, following
-        logger.warning("joint inversion: %d steps did not reach the tolerance", most)
+        logger.warning(
+            "joint inversion: %d steps did not reach the tolerance, half a sigma; solutions that follow "
+            "go on from there", most,
+        )  # fmt: skip
         return most, True
 
 
