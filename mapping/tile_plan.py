@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import netCDF4
 import numpy as np
@@ -20,6 +22,8 @@ from mapping.gridding import Window
 from mapping.placed import PlacedStrip, boxes
 from perception.files import existing_file, whole_file
 from perception.records import BoolArray, FloatArray, InputError
+
+logger = logging.getLogger(__name__)
 
 # Part of every tile's key: raise it when the same strips would give another map.
 _METHOD = 3
@@ -192,18 +196,64 @@ class TilePlan:
         return [_digest(one) for one in self.strips]
 
 
-# Poses and offsets (m, rad) that differ by less are the same: a graph solved again ends a 1e-11 m aside, and no tile
-# has to be made anew for that.
-_SAME = 1e-5
-
-
 def _digest(one: FiledStrip) -> bytes:
     """Return the digest of a strip: its rows, where it lies, how high and how sure."""
     digest = hashlib.blake2b(one.file.digest.encode(), digest_size=16)
-    offset = np.array([one.strip.height_m, one.strip.height_sigma_m])
-    for array in (offset, *_poses(one).values(), one.strip.across_m, one.strip.reach_m):
-        digest.update(np.round(np.asarray(array, float) / _SAME).tobytes())
+    for array in _placing(one).values():
+        digest.update(np.asarray(array, float).tobytes())
     return digest.digest()
+
+
+# A strip's place is the same where lengths differ by no more than a hundredth of a millimetre, headings by no more
+# than that over ten kilometres, variances by no more than a part of them.
+_SAME_M, _SAME_RAD, _SAME_VARIANCE = 1e-5, 1e-9, 1e-6
+
+
+def as_planned(strips: Sequence[FiledStrip], path: Path) -> list[FiledStrip]:
+    """Return strips at the very poses of an earlier plan, where they lie the same but for a graph's last digits.
+
+    A graph solved again ends some 1e-11 m aside, and no tile has to be made anew for that. Poses are compared and
+    not rounded, for rounding has edges; and the earlier ones stay, so that no number of runs creeps away.
+
+    Parameters
+    ----------
+    path : as `save_plan` wrote it. Without one, or with one that cannot be read, strips are as they are.
+    """
+    if not path.exists():
+        return list(strips)
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            said = {one["digest"]: (i, one) for i, one in enumerate(_head(data)["strips"])}
+            # One strip at a time: the poses of a long survey are many.
+            return [
+                _as_said(one, data, *said[one.file.digest]) if one.file.digest in said else one
+                for one in strips
+            ]
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        logger.info("%s: not read (%s), so all poses count as new", path, error)
+        return list(strips)
+
+
+def _as_said(one: FiledStrip, data: Any, index: int, said: dict[str, Any]) -> FiledStrip:
+    earlier = _strip_of(data, index, said)
+    if not _lie_alike(one, earlier):
+        return one
+    return filed(one.file, earlier.strip, earlier.altitude_m)
+
+
+def _lie_alike(one: FiledStrip, other: FiledStrip) -> bool:
+    pairs = zip(_placing(one).items(), _placing(other).values(), strict=True)
+    return all(
+        np.shape(ours) == np.shape(theirs)
+        and np.allclose(
+            ours,
+            theirs,
+            rtol=_SAME_VARIANCE if name == "position_m2" else 0.0,
+            atol={"heading_rad": _SAME_RAD, "position_m2": 0.0}.get(name, _SAME_M),
+            equal_nan=True,
+        )
+        for (name, ours), theirs in pairs
+    )
 
 
 def plan_tiles(
@@ -231,6 +281,12 @@ def _poses(one: FiledStrip) -> dict[str, FloatArray]:
     }
 
 
+def _placing(one: FiledStrip) -> dict[str, Any]:
+    """Return all that decides where a strip's rows come to lie and what they count."""
+    names = ("across_m", "reach_m", "height_m", "height_sigma_m")
+    return _poses(one) | {name: getattr(one.strip, name) for name in names}
+
+
 def save_plan(path: Path, plan: TilePlan) -> None:
     """Write a plan for the workers, whole or not at all."""
     head = {
@@ -253,18 +309,21 @@ def save_plan(path: Path, plan: TilePlan) -> None:
 def load_plan(path: Path) -> TilePlan:
     """Read what `save_plan` wrote."""
     with np.load(path, allow_pickle=False) as data:
-        head = json.loads(str(data["head"]))
-        strips = [
-            _strip_of(said, {name: data[f"{index}/{name}"] for name in (*_POSES, "across_m", "reach_m")})
-            for index, said in enumerate(head["strips"])
-        ]  # fmt: skip
+        head = _head(data)
+        strips = [_strip_of(data, index, said) for index, said in enumerate(head["strips"])]
     return TilePlan(
         head["cell_m"], head["crs"], head["datum"], Window(*head["window"]), head["tile_cells"],
         tuple(strips),
     )  # fmt: skip
 
 
-def _strip_of(said: dict[str, Any], arrays: dict[str, FloatArray]) -> FiledStrip:
+def _head(data: Any) -> dict[str, Any]:
+    head: dict[str, Any] = json.loads(str(data["head"]))
+    return head
+
+
+def _strip_of(data: Any, index: int, said: dict[str, Any]) -> FiledStrip:
+    arrays = {name: data[f"{index}/{name}"] for name in (*_POSES, "across_m", "reach_m")}
     strip = PlacedStrip(
         across_m=arrays["across_m"],
         easting_m=arrays["easting_m"],

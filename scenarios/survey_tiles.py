@@ -25,7 +25,7 @@ from mapping.survey_records import CorrectedSurvey, SurveyConfig
 from mapping.textures import MatchConfig
 from mapping.tile_figures import map_figures
 from mapping.tile_fill import fill_tiles, with_fill
-from mapping.tile_plan import TILE_CELLS, TilePlan, filed, plan_tiles
+from mapping.tile_plan import TILE_CELLS, TilePlan, as_planned, filed, plan_tiles
 from mapping.tile_run import fuse_tiles, tiles_to_make
 from mapping.tile_store import FILL_LAYERS, TileStore
 from perception.objects import ObjectTable
@@ -143,6 +143,7 @@ def map_tiles(
         filed(one.file, _placed(one, corrected, index), one.thin.altitude_m)
         for index, one in enumerate(passes)
     ]
+    strips = as_planned(strips, folder / "plan.npz")
     plan = plan_tiles(strips, cell, survey.crs, survey.datum, tile_cells)
     # A local cluster takes seconds to start: a handful of tiles is made here in that time.
     alone = scheduler is None and tiles_to_make(plan, folder) <= _TILES_MADE_HERE

@@ -14,7 +14,16 @@ from mapping.mosaic import echo_mosaic
 from mapping.placed import placed
 from mapping.quality import survey_quality
 from mapping.tile_figures import map_figures
-from mapping.tile_plan import StripFile, TilePlan, filed, load_plan, plan_tiles, save_plan
+from mapping.tile_plan import (
+    FiledStrip,
+    StripFile,
+    TilePlan,
+    as_planned,
+    filed,
+    load_plan,
+    plan_tiles,
+    save_plan,
+)
 from mapping.tile_run import fuse_tiles
 from mapping.tile_store import TileStore
 from mapping.tiles import LAYERS
@@ -189,6 +198,49 @@ def test_a_killed_run_goes_on_and_changed_strips_are_made_anew(tmp_path: Path) -
     # Another cell: nothing of the old store is left.
     assert fuse_tiles(plan_tiles(plan.strips, 2.0, CRS, tile_cells=40), folder)[2] > 0
     assert TileStore(folder).read("elevation", (slice(0, 1), slice(0, 1))).shape == (1, 1)
+
+
+def moved(one: FiledStrip, east_m: float, north_m: float = 0.0, turn: float = 0.0) -> FiledStrip:
+    place = replace(
+        one.strip,
+        easting_m=one.strip.easting_m + east_m,
+        northing_m=one.strip.northing_m + north_m,
+        heading_rad=one.strip.heading_rad + turn,
+    )
+    return replace(one, strip=place)
+
+
+def western_edge(one: FiledStrip) -> float:
+    across = np.cos(one.strip.heading_rad)[:, None] * one.strip.reach_m
+    return float(np.nanmin(one.strip.easting_m[:, None] + across))
+
+
+def test_poses_of_a_graph_solved_again_remake_no_tile(tmp_path: Path) -> None:
+    """On edges of rounding and of the map's lattice a hair is no move; more than 1e-5 m in all is one."""
+    strips, track = a_survey(np.random.default_rng(3))
+    first = list(a_plan(tmp_path, strips, track, 1.0, 40).strips)
+    edges = np.round(first[1].strip.northing_m, 5) + 0.5e-5
+    first[1] = replace(first[1], strip=replace(first[1].strip, northing_m=edges))
+    # A hair further west the map has a column more.
+    to_edge_m = -(min(western_edge(one) for one in first) % 1.0)
+    first = [moved(one, to_edge_m) for one in first]
+    folder = tmp_path / "tiles"
+
+    def planned(there: list[FiledStrip]) -> TilePlan:
+        return plan_tiles(as_planned(there, folder / "plan.npz"), 1.0, CRS, tile_cells=40)
+
+    plan = planned(first)
+    assert fuse_tiles(plan, folder)[2] == len(plan.tiles())
+    for hair in (1e-9, -1e-9):
+        again = planned([moved(one, hair, -hair, 1e-3 * hair) for one in first])
+        assert again.window == plan.window and fuse_tiles(again, folder)[2] == 0
+    # Twice six micrometres are beside the first, not beside the one between.
+    touched = sum(1 in plan.touching(tile) for tile in plan.tiles())
+    for aside, expected in ((6e-6, 0), (1.2e-5, touched)):
+        again = planned([first[0], moved(first[1], 0.0, aside), first[2]])
+        assert fuse_tiles(again, folder)[2] == expected
+    (folder / "plan.npz").write_bytes(b"PK, but no plan")
+    assert as_planned(first, folder / "plan.npz") == first
 
 
 def test_a_run_killed_between_tile_and_mark_leaves_no_mark_of_an_older_run(
