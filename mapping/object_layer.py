@@ -49,7 +49,8 @@ class ObjectLayer:
 def read_objects(path: Path, grid: Grid) -> ObjectLayer:
     """Read objects of any point layer GDAL knows, or a CSV with `easting_m` and `northing_m`.
 
-    Without a footprint in the file the radius is the object's height, at least two cells.
+    Without a footprint in the file the radius is the object's height, at least two cells. What the file marks
+    `overruled` is no object and left out (`mapping.overruled`).
 
     Raises
     ------
@@ -64,6 +65,10 @@ def read_objects(path: Path, grid: Grid) -> ObjectLayer:
             f"{path}: cannot be read as objects ({error}); give an objects.gpkg or objects.csv"
         ) from error
     columns: Mapping[str, Any] = dict(zip(meta["fields"], values, strict=True))
+    if "overruled" in columns:
+        stands = ~np.isin(np.array([str(v).lower() for v in columns["overruled"]]), ("1", "true"))
+        columns = {name: column[stands] for name, column in columns.items()}
+        geometry = None if geometry is None else geometry[stands]
     east, north = _positions(path, meta, geometry, columns, grid)
     nowhere = np.flatnonzero(~(np.isfinite(east) & np.isfinite(north)))
     if len(nowhere):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ from mapping.flag_layer import (
 )
 from mapping.height_tie import HeightTie
 from mapping.mosaic import echo_mosaic, write_mosaic
-from mapping.objects import merge_objects, write_objects
+from mapping.objects import MergedObjects, merge_objects, write_objects
+from mapping.overruled import overruled
 from mapping.pose_graph_files import write_graph
 from mapping.quality import (
     S44_ORDERS,
@@ -67,7 +69,7 @@ def write_whole(
     write_mosaic(out / "mosaic.tif", mosaic)
     _write_pictures(out, drawn, mosaic, result.raw_track, result.track)
     pings = [summary.strip.ping for summary in result.passes]
-    shared = _write_shared(out, survey, result, pings, tie)
+    shared = _write_shared(out, survey, result, pings, tie, result.grid)
     seen = np.isfinite(grid.elevation_m)
     number = None if filled is None else int(filled.sum())
     return (
@@ -193,8 +195,12 @@ def _write_shared(
     result: SurveyMap | TiledSurvey,
     pings: Sequence[npt.NDArray[Any]],
     tie: HeightTie | None,
+    grid: Grid | None = None,
 ) -> dict[str, Any]:
-    """Write tracks, soundings, objects and the prior map's changes; return what is known of the survey."""
+    """Write tracks, soundings, objects and the prior map's changes; return what is known of the survey.
+
+    `grid` : the map whose floor the objects stand on; None of a map in tiles, where each pass takes its own.
+    """
     write_trajectory(out / "trajectory.csv", from_true_north(result.track))
     write_trajectory(out / "trajectory-navigated.csv", from_true_north(result.raw_track))
     write_tracks(out / "tracks.gpkg", result.track, result.raw_track)
@@ -205,16 +211,27 @@ def _write_shared(
     changes.unlink(missing_ok=True)  # an earlier run's
     if tie is not None:
         write_changes(changes, tie.left)
-    objects = _write_objects(out, result.objects, pings, result.track, survey.crs)
+    merged = _merged(result, pings, grid)
+    # The looks as they were seen, and the objects that they are of.
+    write_objects_csv(out / "objects.csv", ObjectTable.joined(list(result.objects)))
+    write_objects(out / "objects.gpkg", merged, survey.crs)
+    first = np.cumsum([0, *(len(table) for table in result.objects)])
     looks = [
         look
-        for contacts, table in zip(result.contacts, result.objects, strict=True)
-        for look in moved(contacts, table)
+        for contacts, table, start in zip(result.contacts, result.objects, first, strict=False)
+        for look in moved(contacts, table, merged.look[start : start + len(table)] + 1)
     ]
+    unseen = {int(k) + 1 for k in np.flatnonzero(merged.overruled)}
     names = [file.path.name for file in survey.files]
     title = ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
-    write_contacts(out / "contacts.html", looks, title, survey.crs)
-    return _survey_metrics(survey, result.corrected) | objects
+    write_contacts(out / "contacts.html", looks, title, survey.crs, unseen)
+    return _survey_metrics(survey, result.corrected) | {
+        "objects": sum(len(t) for t in result.objects),
+        "objects_merged": len(merged.height_m),
+        "objects_disputed": int(merged.disputed.sum()),
+        "objects_overruled": int(merged.overruled.sum()),
+        "objects_on_map_floor": grid is not None and grid.sigma_m is not None,
+    }
 
 
 def _survey_metrics(survey: Survey, corrected: CorrectedSurvey) -> dict[str, Any]:
@@ -240,27 +257,21 @@ def _survey_metrics(survey: Survey, corrected: CorrectedSurvey) -> dict[str, Any
     }
 
 
-def _write_objects(
-    out: Path,
-    tables: Sequence[ObjectTable],
-    pings: Sequence[npt.NDArray[Any]],
-    track: Trajectory,
-    crs: str,
-) -> dict[str, Any]:
-    """Write the objects of every pass, and those that several passes share as one."""
-    write_objects_csv(out / "objects.csv", ObjectTable.joined(list(tables)))
-    sigma_m = []
+def _merged(
+    result: SurveyMap | TiledSurvey, pings: Sequence[npt.NDArray[Any]], grid: Grid | None
+) -> MergedObjects:
+    """Return the objects that the passes' looks are of, marked where the map of all overrules one."""
+    track, sigma_m = result.track, []
     for rows in pings:
         place_m2 = track.sigma_easting_m[rows] ** 2 + track.sigma_northing_m[rows] ** 2
         # Between passes of one survey half a metre is what beam width and layover leave at least.
         sigma_m.append(max(0.5, float(np.sqrt(0.5 * np.nanmean(place_m2)))))
-    merged = merge_objects(tables, sigma_m)
-    write_objects(out / "objects.gpkg", merged, crs)
-    return {
-        "objects": sum(len(t) for t in tables),
-        "objects_merged": len(merged.height_m),
-        "objects_disputed": int(merged.disputed.sum()),
-    }
+    merged = merge_objects(result.objects, sigma_m, one_floor=grid is not None)
+    if grid is None:
+        return merged
+    owner = np.repeat(np.arange(len(result.objects)), [len(table) for table in result.objects])
+    strips = result.corrected.strips
+    return replace(merged, overruled=overruled(merged, owner, grid, strips))
 
 
 def write_soundings(path: Path, corrected: CorrectedSurvey, tie: HeightTie | None = None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,6 +33,7 @@ class Contact:
     """One object of one pass as the page shows it; metres, `snippet` a PNG.
 
     `parts` : what touches it, in words: a wreck's hull, mast and holes are one contact, told by its highest part.
+    `object_number` : the row of objects.gpkg, from 1, that several passes' looks share; 0 of a pass alone.
     """
 
     easting_m: float
@@ -50,6 +51,7 @@ class Contact:
     ping: int
     snippet: bytes
     parts: tuple[str, ...] = ()
+    object_number: int = 0
 
 
 def contacts_of(result: PassResult) -> list[Contact]:
@@ -57,11 +59,15 @@ def contacts_of(result: PassResult) -> list[Contact]:
     table = result.objects
     contacts = []
     for members in touching(table):
-        # The least height of a shadow that leaves the swath tells less of a contact than a measured one.
-        rank = np.where(table.lower_bound[members], 0.5, 1.0) * table.height_m[members]
-        i, *others = members[np.argsort(-rank)]
+        i, *others = _by_rank(table, members)
         contacts.append(replace(_contact(result, int(i)), parts=_parts(table, others)))
     return contacts
+
+
+def _by_rank(table: ObjectTable, rows: IntArray) -> IntArray:
+    """Return rows, the highest first; the least height of a shadow that leaves the swath tells less than a measured one."""
+    rank = np.where(table.lower_bound[rows], 0.5, 1.0) * table.height_m[rows]
+    return rows[np.argsort(-rank)]
 
 
 def _contact(result: PassResult, i: int) -> Contact:
@@ -102,7 +108,7 @@ def touching(table: ObjectTable) -> list[IntArray]:
     return [np.flatnonzero(group == number) for number in range(count)]
 
 
-def _parts(table: ObjectTable, rows: Sequence[int]) -> tuple[str, ...]:
+def _parts(table: ObjectTable, rows: Sequence[int] | IntArray) -> tuple[str, ...]:
     """Return the parts of a contact in words, the highest first."""
     return tuple(
         f"{table.kind[i]}, {'at least ' if table.lower_bound[i] else ''}"
@@ -122,8 +128,15 @@ def pictured(contacts: Sequence[Contact], most: int = _MOST) -> list[Contact]:
     ]
 
 
-def moved(contacts: Sequence[Contact], table: ObjectTable) -> list[Contact]:
-    """Return a pass's contacts where its objects lie in `table`, the same objects on a corrected track."""
+def moved(
+    contacts: Sequence[Contact], table: ObjectTable, numbers: IntArray | None = None
+) -> list[Contact]:
+    """Return a pass's contacts as its objects are in `table`, the same ones on a corrected track and a map's floor.
+
+    Parameters
+    ----------
+    numbers : (rows of `table`,) the `object_number` of each.
+    """
     # Port and starboard of one ping may have the same kind at the same sample.
     rows = {
         (int(ping), float(range_m), kind, bool(across_m > 0)): k
@@ -132,8 +145,17 @@ def moved(contacts: Sequence[Contact], table: ObjectTable) -> list[Contact]:
         )
     }
     at = [rows[c.ping, c.slant_range_m, c.kind, c.across_m > 0] for c in contacts]
+    touches = {int(i): members for members in touching(table) for i in members}
     return [
-        replace(c, easting_m=float(table.easting_m[k]), northing_m=float(table.northing_m[k]))
+        replace(
+            c,
+            easting_m=float(table.easting_m[k]),
+            northing_m=float(table.northing_m[k]),
+            height_m=float(table.height_m[k]),
+            sigma_m=float(table.sigma_m[k]),
+            parts=_parts(table, _by_rank(table, touches[k][touches[k] != k])),
+            object_number=0 if numbers is None else int(numbers[k]),
+        )
         for c, k in zip(contacts, at, strict=True)
     ]
 
@@ -170,17 +192,28 @@ def _png(ratio: FloatArray) -> bytes:
     return buffer.getvalue()
 
 
-def write_contacts(path: Path, contacts: Sequence[Contact], title: str, crs: str) -> None:
-    """Write the page, likeliest contacts first; no contact gives a page that says so."""
+def write_contacts(
+    path: Path,
+    contacts: Sequence[Contact],
+    title: str,
+    crs: str,
+    overruled: Collection[int] = (),
+) -> None:
+    """Write the page, likeliest contacts first; no contact gives a page that says so.
+
+    Parameters
+    ----------
+    overruled : numbers of the objects at whose place other passes saw plain ground.
+    """
     ranked = sorted(contacts, key=lambda contact: -contact.probability)
     shown, disputed = ranked[:_MOST], _disputed(ranked)
     places = _places(shown, crs)
     cards = "\n".join(
-        _card(number, contact, place, contact in disputed)
+        _card(number, contact, place, _marks(contact, disputed, overruled))
         for number, (contact, place) in enumerate(zip(shown, places, strict=True), start=1)
     )
     hills = sum(contact.kind == "hill" for contact in contacts)
-    said = f"{len(contacts)} contacts: {hills} hills, {len(contacts) - hills} craters"
+    said = f"{_counted(contacts)}: {hills} hills, {len(contacts) - hills} craters"
     if len(contacts) > len(shown):
         said += f"; the {len(shown)} likeliest are shown, all are in objects.csv"
     said += "."
@@ -192,6 +225,24 @@ def write_contacts(path: Path, contacts: Sequence[Contact], title: str, crs: str
             title=html.escape(title), said=said, crs=html.escape(_short(crs)), cards=cards
         ),
     )
+
+
+def _counted(contacts: Sequence[Contact]) -> str:
+    """Return how many contacts there are, and of how many objects where passes were brought together."""
+    numbers = {contact.object_number for contact in contacts} - {0}
+    if not numbers:
+        return f"{len(contacts)} contacts"
+    return f"{len(contacts)} looks of single passes at {len(numbers)} objects (objects.gpkg)"
+
+
+def _marks(contact: Contact, disputed: Collection[Contact], overruled: Collection[int]) -> str:
+    """Return what other passes have against a contact."""
+    said = []
+    if contact in disputed:
+        said.append("disputed: another pass saw the other kind")
+    if contact.object_number in overruled:
+        said.append("overruled: other passes saw plain ground here")
+    return "".join(f'<b class="mark">{mark}</b>' for mark in said)
 
 
 def _disputed(contacts: Sequence[Contact]) -> set[Contact]:
@@ -222,14 +273,13 @@ def _short(crs: str) -> str:
     return crs if len(crs) < 40 else "local metric grid"
 
 
-def _card(number: int, contact: Contact, place: str, disputed: bool) -> str:
+def _card(number: int, contact: Contact, place: str, mark: str) -> str:
     picture = ""
     if contact.snippet:
         data = base64.b64encode(contact.snippet).decode("ascii")
         picture = f'<img alt="echo of contact {number}" src="data:image/png;base64,{data}">'
     what = "height" if contact.kind == "hill" else "depth"
     least = "at least " if contact.lower_bound else ""
-    mark = '<b class="mark">disputed: another pass saw the other kind</b>' if disputed else ""
     side = "starboard" if contact.across_m > 0 else "port"
     rows = [
         (what, f"{least}{contact.height_m:.2f} m &plusmn; {contact.sigma_m:.2f} m"),
@@ -238,6 +288,7 @@ def _card(number: int, contact: Contact, place: str, disputed: bool) -> str:
         ("slant range", f"{contact.slant_range_m:.2f} m to {side}"),
         ("shadow", f"{contact.shadow_length_m:.2f} m{', runs out of the swath' if least else ''}"),
         ("pass, ping", f"{contact.pass_index}, {contact.ping}"),
+        ("object", str(contact.object_number or "")),
         ("probability", f"{contact.probability:.0%}"),
         *(("part", part) for part in contact.parts[:_MOST_PARTS]),
     ]

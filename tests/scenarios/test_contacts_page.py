@@ -109,3 +109,34 @@ def test_two_objects_of_one_ping_at_one_range_move_each_to_its_own_side() -> Non
     table = ObjectTable.of([_row(20, 50, 22, 4), _row(-20, 50, 22, 4)])
     there = replace(table, easting_m=np.array([120.0, 80.0]))
     assert [look.easting_m for look in moved(sides, there)] == [120.0, 80.0]
+
+
+def test_a_maps_page_tells_the_heights_of_its_own_list_and_whose_looks_they_are(
+    tmp_path: Path,
+) -> None:
+    low, high = box(0.7, 15, 10, 0.8, 0.8), box(1.2, 16, 13.2, 0.8, 0.8)
+    swath = make_swath(
+        lambda x, y: low(x, y) + high(x, y), Survey(n_pings=90, n_samples=500),
+        np.random.default_rng(5),
+    )  # fmt: skip
+    result = build_strip(swath)
+    # Wide enough to touch.
+    table = replace(result.objects, half_along_m=result.objects.half_along_m + 1.0)
+    (contact,) = contacts_of(replace(result, objects=table))
+    assert len(table) == 2 and len(contact.parts) == 1
+    # What `mapping.object_floors` changes.
+    mended = replace(table, height_m=table.height_m + 0.25, sigma_m=table.sigma_m / 2)
+    (look,) = moved([contact], mended, np.array([7, 7]))
+    top = int(np.flatnonzero(table.height_m == contact.height_m)[0])
+    assert look.height_m == mended.height_m[top] and look.sigma_m == mended.sigma_m[top]
+    assert (
+        f"{mended.height_m[1 - top]:.2f} m &plusmn; {mended.sigma_m[1 - top]:.2f} m"
+        in look.parts[0]
+    )
+    other = replace(look, pass_index=1, object_number=8)
+    third = replace(look, pass_index=2)
+    write_contacts(tmp_path / "contacts.html", [look, other, third], "survey.xtf", CRS, {8})
+    page = (tmp_path / "contacts.html").read_text()
+    assert "3 looks of single passes at 2 objects (objects.gpkg): 3 hills" in page
+    assert page.count("<dt>object</dt><dd>7</dd>") == 2
+    assert page.count("overruled: other passes saw plain ground here") == 1
