@@ -84,7 +84,7 @@ def _draw_map(
     axes.tick_params(axis="x", labelrotation=30)
     # Below the picture: anywhere inside it would lie over the track sooner or later.
     axes.legend(
-        loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, facecolor="0.75"
+        loc="upper center", bbox_to_anchor=(0.5, -0.24), ncols=3, fontsize=8, facecolor="0.75"
     )
     axes.set_title("Track on the prior map")
 
@@ -110,6 +110,7 @@ def _draw_sigma(axes: Axes, causal: Trajectory, smoothed: Trajectory) -> None:
         )
     axes.set_ylim(low, high)
     axes.set_ylabel("metres")
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xlabel("minutes")
     axes.legend(fontsize=7, ncol=2)
     axes.set_title("How well the position is known")
@@ -147,7 +148,9 @@ def draw_observability(path: Path, prior: Grid, found: Observability) -> None:
         image = panel.imshow(
             values, extent=extent, cmap=colours, norm=norm, interpolation="nearest"
         )
-        figure.colorbar(image, ax=panel, label=label, shrink=0.75)
+        bar = figure.colorbar(image, ax=panel, label=label, shrink=0.75)
+        if norm is not None:
+            _plain_ticks(bar.ax, float(low), float(high))
         panel.set_xlabel("easting (m)")
         panel.ticklabel_format(useOffset=False, style="plain")
         panel.tick_params(axis="x", labelrotation=30)
@@ -155,6 +158,16 @@ def draw_observability(path: Path, prior: Grid, found: Observability) -> None:
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=110)
     plt.close(figure)
+
+
+def _plain_ticks(axes: Axes, low: float, high: float) -> None:
+    """Tick a logarithmic scale at 1, 2 and 5 of each decade, in plain numbers."""
+    decades = range(int(np.floor(np.log10(max(low, 1e-3)))), int(np.ceil(np.log10(high))) + 1)
+    ticks = [m * 10.0**d for d in decades for m in (1, 2, 5) if low <= m * 10.0**d <= high]
+    # Within less than an octave there may be no such tick: then the ends are told.
+    axes.set_yticks(ticks if len(ticks) > 1 else [low, *ticks, high])
+    axes.set_yticks([], minor=True)
+    axes.yaxis.set_major_formatter("{x:.3g}")
 
 
 def draw_placing(path: Path, prior: Grid, patch: Grid, placing: Placing) -> None:

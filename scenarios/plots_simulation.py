@@ -45,10 +45,12 @@ def _draw_truth(axes, simulation: Simulation) -> None:  # type: ignore[no-untype
         if places:
             axes.plot(*np.transpose(places), marker, mfc="none", mec="k", ms=4, label=kind)
     survey, back = simulation.survey.truth, simulation.nav.truth
-    axes.plot(survey.easting_m, survey.northing_m, "w.", ms=0.7, label="survey")
+    axes.plot(survey.easting_m, survey.northing_m, "w.", ms=0.7)
+    axes.plot([], [], "w-", lw=1.5, label="survey")
     if scenario.locate.track == "return":
         axes.plot(back.easting_m, back.northing_m, "r-", lw=0.8, label="return")
-    axes.legend(loc="upper right", fontsize=7)
+    # The survey's line is white: no legend shows it on white.
+    axes.legend(loc="upper right", fontsize=7, facecolor="0.6", framealpha=0.9)
     axes.set(xlabel="easting, m", ylabel="northing, m", title=f"{scenario.name}: the true floor")
     axes.ticklabel_format(useOffset=False, style="plain")
     axes.locator_params(axis="x", nbins=5)

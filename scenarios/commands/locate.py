@@ -143,7 +143,7 @@ _WORDS = {
     "sigma_best_median_m": "1-sigma on the best heading, median (m)",
     "sigma_mean_median_m": "1-sigma over all headings, median (m)",
     "sigma_worst_median_m": "1-sigma on the worst heading, median (m)",
-    "over_bound_median": "the same over the linear bound, median",
+    "over_bound_median": "the same over the linear bound, median (times)",
     "share_below_10_m": "part of the map known to 10 m",
     "seconds": "time taken (s)",
 }

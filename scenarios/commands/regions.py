@@ -85,6 +85,8 @@ def command(
     grid = read_map(map_path, map_sigma_m)
     config = _config(grid, method, scale_m, detail_m, window_m, levels)
     prepare_out(out)
+    if not quiet:
+        _tell_of_compiling()
     start = perf_counter()
     objects = None if objects_path is None else read_objects(objects_path, grid)
     surface, lifted = grid, None
@@ -165,9 +167,9 @@ def _print(result: Segmentation, metrics: dict[str, Any], out: Path) -> None:
 
     rows = [
         ("regions", f"{metrics['regions']} ({metrics['borders']} borders)"),
-        ("smoothing (median)", f"{metrics['scale_median_m']:.3g} m"),
+        ("smoothing (median)", _length(metrics["scale_median_m"], "none")),
         ("classes read at", f"{result.detail_m:g} m" if result.detail_m > 0 else "that scale"),
-        ("independent noise (median)", f"{metrics['noise_median_m']:.3g} m"),
+        ("independent noise (median)", _length(metrics["noise_median_m"], "none seen")),
     ]
     codes = result.regions.table["class_code"]
     for code, name in enumerate(REGION_CLASSES[1:], start=1):
@@ -180,3 +182,21 @@ def _print(result: Segmentation, metrics: dict[str, Any], out: Path) -> None:
     rows.append(("seconds", f"{metrics['seconds']:.2f}"))
     print_table(f"regions of {metrics['cells']} cells", rows)
     click.echo(f"written to {out}")
+
+
+def _tell_of_compiling() -> None:
+    """Say, on standard error, why the first run of an installation takes minutes."""
+    from perception.curvature import differentiate
+
+    if not _compiled(Path(differentiate.stats.cache_path)):
+        click.echo("note: compiling for this machine, once: a minute or two", err=True)
+
+
+def _compiled(cache: Path) -> bool:
+    """Tell whether kernels of both modules that a map needs were compiled into a folder before."""
+    return all(any(cache.glob(f"{name}.*.nbi")) for name in ("curvature", "scale"))
+
+
+def _length(value_m: float, none: str) -> str:
+    """Return a length in words: what is below a hundredth of a millimetre is rounding."""
+    return f"{value_m:.3g} m" if value_m >= 1e-5 else none

@@ -13,6 +13,9 @@ from perception.files import whole_file
 from perception.records import FloatArray, Grid, Trajectory
 from scenarios.plots_survey import shaded_relief
 
+# The part of the altitude that is water for certain, whatever slope the first return comes from.
+_WATER_PART = 0.6
+
 
 def plot_overview(out: Path, path: Path) -> None:
     """Draw the mission in `out` (all stages done) into `path`."""
@@ -70,11 +73,17 @@ def _echoes(axes: Any, out: Path) -> None:
 
     survey = open_survey(sorted((out / "simulate").glob("survey*.xtf")))
     swath = survey.swath(min(1, survey.n_passes - 1))
-    image = np.concatenate([swath.port[:, ::-1], swath.starboard], axis=1)
+    slant_m = (np.arange(swath.n_samples) + 0.5) * swath.sample_m[:, None]
+    # The pulse itself rings on in the water column, brighter than any ground: it is no echo.
+    with np.errstate(invalid="ignore"):
+        water = slant_m < _WATER_PART * swath.altitude_hint_m[:, None]
+    sides = [np.where(water, 0.0, side) for side in (swath.port, swath.starboard)]
+    image = np.concatenate([sides[0][:, ::-1], sides[1]], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         level = np.log10(np.where(image > 0, image, np.nan))
     low, high = np.nanpercentile(level, [5, 99])
     reach_m = swath.n_samples * float(np.median(swath.sample_m))
+    axes.set_facecolor("black")
     axes.imshow(
         level, cmap="copper", vmin=low, vmax=high, aspect="auto",
         extent=(-reach_m, reach_m, swath.n_pings, 0),

@@ -207,6 +207,26 @@ def test_a_patch_is_placed_on_a_map_of_the_sigma_that_is_given(
     assert sigmas[1] > 1.05 * sigmas[0]
 
 
+def test_a_patch_without_any_place_has_no_row_of_nan(files: Path, tmp_path: Path) -> None:
+    flat = Grid(np.zeros((40, 40)), 0.0, 200.0, 5.0)
+    write_map(tmp_path / "flat.tif", flat)
+    result = locate(
+        "--map", files / "prior.tif", "--patch", tmp_path / "flat.tif", "--heading", 0, "--out", tmp_path / "out"
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "no fix" in result.output and "nan" not in result.output
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["ambiguity"] is None
+
+
+def test_soundings_off_the_map_are_told_in_the_verdict(files: Path, tmp_path: Path) -> None:
+    table = pd.read_csv(files / "nav.csv")
+    table = table.assign(depth_m=-table.depth_m).head(40)
+    table.to_csv(tmp_path / "up.csv", index=False)
+    result = locate("--map", files / "prior.tif", "--nav", tmp_path / "up.csv", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert "above the map throughout: units, sign of depth, or datum?" in result.output
+
+
 def test_figures_are_printed_in_words_and_one_sigma_at_a_time() -> None:
     told = in_words(
         {"sigma_last_m": 1.234567, "converged": True, "easting_m": 512345.678, "events": ""}

@@ -10,7 +10,7 @@ from rasterio.transform import from_origin
 
 from mapping.rasters import write_map
 from perception.records import Grid, InputError
-from scenarios.commands.regions import command
+from scenarios.commands.regions import _compiled, _length, command
 
 
 def write(path, z, sigma=None):
@@ -49,8 +49,8 @@ def test_quiet_prints_nothing(tmp_path):
 
 @pytest.mark.parametrize(
     "z",
-    [np.full((1, 1), -3.0), np.full((1, 30), -3.0), np.full((40, 40), -3.0), hill(40) + 3e6],
-    ids=["one cell", "one row", "constant", "millions"],
+    [np.full((1, 1), -3.0), np.full((1, 30), -3.0), np.full((40, 40), -3.0), hill(40) + 1.1e4],
+    ids=["one cell", "one row", "constant", "kilometres up"],
 )
 @pytest.mark.parametrize("scale", [None, 1000.0], ids=["chosen", "wider than the map"])
 def test_odd_maps_give_a_clear_result(tmp_path, z, scale):
@@ -155,3 +155,15 @@ def test_objects_become_a_layer_of_their_own(tmp_path):
     meta, _, _, values = pyogrio.raw.read(tmp_path / "out" / "objects.gpkg")
     found = dict(zip(meta["fields"], values, strict=True))
     assert found["height_over_floor_m"][0] == pytest.approx(3, abs=0.3)
+
+
+def test_lengths_of_rounding_are_told_in_words():
+    assert _length(8e-15, "none seen") == "none seen"
+    assert _length(0.25, "none") == "0.25 m"
+
+
+def test_a_first_run_knows_itself_by_the_kernels_that_are_missing(tmp_path):
+    (tmp_path / "curvature.differentiate-1.py311.nbi").touch()
+    assert not _compiled(tmp_path)
+    (tmp_path / "scale._mix-1.py311.nbi").touch()
+    assert _compiled(tmp_path)
