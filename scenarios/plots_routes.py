@@ -29,6 +29,8 @@ _PIXELS = 900
 _DPI = 110
 # Least width of a map's picture over its height, where the map is as wide.
 _LEAST_ASPECT = 0.7
+# Ground that no route may pass.
+_BARRED = (0.75, 0.75, 0.75, 1.0)
 # White lines are lost on pale ground and in a legend without an edge.
 _OUTLINED = (withStroke(linewidth=2.0, foreground="0.25"),)
 
@@ -173,7 +175,17 @@ def _draw_map(axes: Any, surface: Surface, box: tuple[int, ...]) -> None:
         filled, plt.get_cmap("viridis"), vmin=low, vmax=max(high, low + 1e-6), dx=width, dy=height,
         blend_mode="soft", vert_exag=1.5,
     )  # fmt: skip
-    shaded[surface.barred[r0:r1:thin, c0:c1:thin]] = (0.75, 0.75, 0.75, 1.0)
+    barred = surface.barred[r0:r1:thin, c0:c1:thin]
+    shaded[barred] = _BARRED
+    if barred.any():
+        axes.plot(
+            [],
+            [],
+            "s",
+            color=_BARRED,
+            mec="0.4",
+            label="barred: no map, too shallow, no-go, or least heights",
+        )
     west, north = surface.world(
         np.array((c0 - 0.5) * surface.cell_m[0]), np.array((r0 - 0.5) * surface.cell_m[1])
     )

@@ -75,13 +75,14 @@ class Asked:
 class Beside:
     """What else bears on the ground, read once and asked of any grid of the map; each gives None without a file.
 
-    `standing_objects` is the number of objects on the map that stand up; None without a file.
+    `standing` is how many objects on the map stand up, and of how many of them only the least height is known, whose
+    ground is barred; None without a file.
     """
 
     forbidden: Callable[[Grid], BoolArray | None]
     position_sigma: Callable[[Grid], FloatArray | None]
     obstacles: Callable[[Grid], Obstacles | None]
-    standing_objects: int | None
+    standing: tuple[int, int] | None
 
 
 def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked:
@@ -108,8 +109,8 @@ def read_asked(given: Given, limits: VehicleLimits, progress: Progress) -> Asked
     began = time.perf_counter()
     problem = replace(problem, weight=_weights(grid, given, reduced))
     more: dict[str, Any] = {"regions_s": time.perf_counter() - began}
-    if beside.standing_objects is not None:
-        more["standing_objects"] = beside.standing_objects
+    if beside.standing is not None:
+        more["standing_objects"], more["barring_objects"] = beside.standing
     if reduced is None:
         return Asked(problem, None, more)
     problem = replace(problem, submerged=not reduced.lowest_m > 0)
@@ -321,8 +322,8 @@ def no_go(path: Path | None, crs: str) -> Callable[[Grid], BoolArray | None]:
 
 def standing(
     path: Path | None, whole: Grid
-) -> tuple[Callable[[Grid], Obstacles | None], int | None]:
-    """Return what gives the objects that stand on a grid, and how many the map has; None where no file is given.
+) -> tuple[Callable[[Grid], Obstacles | None], tuple[int, int] | None]:
+    """Return what gives the objects that stand on a grid, and `Beside.standing`; None where no file is given.
 
     Parameters
     ----------
@@ -335,6 +336,7 @@ def standing(
     from mapping.object_layer import read_objects
     from planning.obstacles import obstacles_on
 
+    _tell_of_looks(path)
     objects = read_objects(path, whole)
     if len(objects.height_m) and not np.isfinite(objects.height_m).any():
         raise InputError(
@@ -349,12 +351,20 @@ def standing(
             f"{path}: none of its {len(on_map)} objects lies on the map; give the list of the same "
             "survey, in the map's CRS"
         )
-    hills = on_map & ~objects.crater
-    logger.info(
-        "%s: %d objects stand on the map, %d of them of unknown height", path, np.sum(hills),
-        np.sum(hills & objects.least),
-    )  # fmt: skip
-    return lambda grid: obstacles_on(grid, objects), int(np.sum(hills))
+    hills = on_map & ~objects.crater & (objects.height_m > 0)
+    counted = int(np.sum(hills)), int(np.sum(hills & objects.least))
+    logger.info("%s: %d objects stand on the map, %d of them of unknown height", path, *counted)
+    return lambda grid: obstacles_on(grid, objects), counted
+
+
+def _tell_of_looks(path: Path) -> None:
+    """Warn where single looks are given beside the objects that they are of."""
+    merged = path.with_name("objects.gpkg")
+    if path.suffix.lower() == ".csv" and merged.exists():
+        logger.warning(
+            "%s: holds single looks, several of one object and some that other passes overruled; %s beside it "
+            "holds the objects: give that", path, merged.name,
+        )  # fmt: skip
 
 
 def _weights(grid: Grid, given: Given, reduced: Reduced | None) -> FloatArray | None:

@@ -107,8 +107,18 @@ def clearance_told(route: Route, floor_m: float, k: float) -> str:
     return f"nowhere less than {over}, proved, {more}"
 
 
-def tell_route(plan: Plan, seconds: float, out: Path, objects: int | None = None) -> None:
-    """Print what the route is like; `objects` is the number that stand on the map, None where no list was given."""
+def objects_told(standing: int | None, barring: int) -> list[tuple[str, str]]:
+    """Return the row of objects: how many the route is held clear of, and how many it may not pass over at all."""
+    if standing is None:
+        return []
+    told = f"{standing} standing on the map"
+    if not barring:
+        return [("objects", f"{told}, held clear of")]
+    return [("objects", f"{told}, {barring} of them of least height only: their ground is barred")]
+
+
+def tell_route(plan: Plan, seconds: float, out: Path, more: dict[str, Any]) -> None:
+    """Print what the route is like; `more` may tell of objects."""
     route = plan.route
     assert route is not None
     rows = [
@@ -118,11 +128,7 @@ def tell_route(plan: Plan, seconds: float, out: Path, objects: int | None = None
         ("altitude", f"mean {route.mean_altitude_m:.2f} m, least {route.min_altitude_m:.2f} m"),
         ("clearance", clearance_told(route, plan.surface.limits.floor_m, plan.k)),
         ("stand-off", f"{route.min_stand_off_m:.2f} m, the least slant distance to the ground"),
-        *(
-            []
-            if objects is None
-            else [("objects", f"{objects} standing on the map, held clear of")]
-        ),
+        *objects_told(more.get("standing_objects"), more.get("barring_objects", 0)),
         ("time", f"{seconds:.2f} s"),
         ("written", str(out / "route.csv")),
     ]

@@ -75,7 +75,7 @@ def route(run: Run) -> None:
     if plan.route is None:
         raise NoPathError(f"{run.given.map_path}: no route: {plan.reason}")
     if not run.quiet:
-        tell_route(plan, run.seconds, run.out, more.get("standing_objects"))
+        tell_route(plan, run.seconds, run.out, more)
 
 
 def _planned(run: Run) -> tuple[Plan, dict[str, Any]]:

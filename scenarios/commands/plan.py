@@ -53,7 +53,7 @@ class Position(click.ParamType):  # type: ignore[type-arg]
 @click.option("--avoid", type=click.Path(path_type=Path), help="No-go areas, a vector file.")
 @click.option(
     "--objects", type=click.Path(path_type=Path),
-    help="objects.gpkg or .csv of `map`: boulders that the map smooths are held clear of too.",
+    help="objects.gpkg of `map` (its .csv holds single looks): boulders that the map smooths are held clear of too.",
 )  # fmt: skip
 @click.option(
     "--regions", type=click.Path(path_type=Path), help="regions.tif to take weights from."
