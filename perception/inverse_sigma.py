@@ -11,11 +11,13 @@ from perception.bands import in_threads
 from perception.inverse_state import Solved, State, linear_problem, present_soundings
 from perception.posterior import Fields, Problem
 from perception.profiles import uncrossed
+from perception.rays import Soundings
 from perception.records import FloatArray
 
-# Ground that no two sides see, or that none sees, is known no better than this part of the soundings' sigma: the
-# rms error of one pass was 0.7 to 0.9 of theirs on four floors.
-_ONE_SIDED_PART = 0.8
+# Ground that no two sides see, or that none sees, is known no better than this part of the soundings' sigma.
+_ONE_SIDED_PART = 0.9
+# So few stretches of track leave a prior's variance open; Student's t has none with two.
+_LEAST_STRETCHES = 3.0
 # A bottom track is early or late by centimetres throughout, whatever the number of its soundings.
 _LATE_M = 0.02
 # A gain that ripples by 0.07 dB and a dome of this part of the altitude between parallel lines explain the same mean echoes
@@ -56,6 +58,28 @@ def _sample_sigma(problem: Problem, state: State, rng: np.random.Generator) -> F
     return np.sqrt(ndimage.uniform_filter(total / state.config.samples, 7, mode="nearest"))
 
 
+def prior_doubt(
+    bottom: Soundings, west_m: float, south_m: float, cell_m: float, shape: tuple[int, int]
+) -> FloatArray:
+    """Return (rows, cols) the factor on a sigma that rests on a prior learned from the track itself.
+
+    What heights differ by over a distance `d` is learned from about ``n = length / d`` separate stretches of track. A
+    normal error whose variance is estimated from `n` values follows Student's t, of variance ``n / (n - 2)``
+    times that (Student, Biometrika 6, 1908). `d` is the distance to the nearest sounding; track over cells that were
+    sounded before does not count again.
+    """
+    sounded = np.zeros(shape, bool)
+    row = np.rint((bottom.northing_m - south_m) / cell_m).astype(np.int64)
+    col = np.rint((bottom.easting_m - west_m) / cell_m).astype(np.int64)
+    sounded[np.clip(row, 0, shape[0] - 1), np.clip(col, 0, shape[1] - 1)] = True
+    step = np.hypot(np.diff(bottom.easting_m), np.diff(bottom.northing_m))
+    usual = float(np.median(step)) if len(step) else cell_m
+    length = float(np.sum(step[step <= 10 * usual])) * np.count_nonzero(sounded) / len(row)
+    distance = np.maximum(ndimage.distance_transform_edt(~sounded), 1.0) * cell_m
+    stretches = np.maximum(length / distance, _LEAST_STRETCHES)
+    return np.sqrt(stretches / (stretches - 2))
+
+
 def honest_sigma(
     state: State, solved: Solved, joint: FloatArray, alone: FloatArray, lead_part: float = 0.5
 ) -> FloatArray:
@@ -87,5 +111,6 @@ def honest_sigma(
     )
     both_sides[:-1, :-1] = (lit > 0) & ~solved.single
     both_sides = ndimage.binary_dilation(both_sides, np.ones((3, 3), bool), iterations=2)
-    sigma = np.where(both_sides, sigma, np.maximum(sigma, _ONE_SIDED_PART * alone))
+    doubt = prior_doubt(state.soundings, state.west_m, state.south_m, state.cell_m, state.shape)
+    sigma = np.where(both_sides, sigma, doubt * np.maximum(sigma, _ONE_SIDED_PART * alone))
     return np.where(beyond, np.maximum(sigma, alone), sigma)

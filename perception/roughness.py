@@ -3,7 +3,8 @@
 The structure function of the bottom track (mean squared difference against lag) is fitted by an
 isotropic spectrum whose precision is ``p0 + p1 k^2 + p2 k^4``. A first return is the nearest point of
 the floor, so the track is smoother than the floor; how much smoother is found by sounding random floors
-of the fitted spectrum in the same way, and the target is corrected until the two agree.
+of the fitted spectrum in the same way. What is seen is multiplied by the part that sounding takes of those, and
+fitted again.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from perception.records import FloatArray
 # Rounds of sounding random floors; the correction settles in five.
 _ROUNDS = 5
 _RANDOM_CELLS = 768
+# Sounding takes no more of a floor's structure than this and, but for chance, adds none.
+_LEAST_TAKEN, _MOST_TAKEN = 0.5, 16.0
 
 
 def learn_roughness(
@@ -37,14 +40,16 @@ def learn_roughness(
     lag, seen, count = structure_function(lines, cell_m)
     seen = np.maximum(seen - 2 * noise_m**2, 0.02 * seen + 1e-8)
     altitude = float(np.median(np.concatenate([p.range_m for p in passes])))
-    target = seen.copy()
-    spectrum = fit_spectrum(lag, target, count, cell_m)
+    spectrum = fit_spectrum(lag, seen, count, cell_m)
     for _ in range(_ROUNDS):
         sounded = sounded_structure(spectrum, lag, altitude, 0.5 * cell_m, rng)
         # Beyond a quarter of the random floor's width its periodic waves say nothing.
         usable = np.isfinite(sounded) & (lag < _RANDOM_CELLS * cell_m / 8)
-        factor = np.where(usable, seen / np.where(usable, sounded, 1.0), 1.0)
-        target *= np.clip(factor, 0.25, 4.0)
+        # The floor's own structure over the sounded one, not the seen over the sounded one: dunes have no spectrum of
+        # this form, and a misfit handed on from round to round grows into relief that nobody saw.
+        own = expected_structure(spectrum, lag, cell_m)
+        taken = np.where(usable, own / np.where(usable, sounded, 1.0), 1.0)
+        target = seen * np.clip(taken, _LEAST_TAKEN, _MOST_TAKEN)
         spectrum = fit_spectrum(lag, target, count, cell_m)
     return spectrum
 
@@ -53,9 +58,7 @@ def fit_spectrum(
     lag_m: FloatArray, value_m2: FloatArray, weight: FloatArray, cell_m: float
 ) -> Spectrum:
     """Return the spectrum whose structure function fits best, in log."""
-    k = np.geomspace(2 * np.pi / (40 * lag_m[-1]), 2 * np.pi / cell_m, 400)
-    # D(h) = 1/pi * integral of k P(k) (1 - J0(k h)) dk for an isotropic spectrum P.
-    kernel = (1 - special.j0(np.outer(lag_m, k))) * k * np.gradient(k) / np.pi
+    k, kernel = _structure_kernel(lag_m, cell_m)
 
     def misfit(parameters: FloatArray) -> FloatArray:
         p0, p1, p2 = np.exp(parameters)
@@ -76,6 +79,22 @@ def fit_spectrum(
     ]
     p0, p1, p2 = np.exp(min(fits, key=lambda fit: fit.cost).x)
     return Spectrum(float(p0), float(p1), float(p2))
+
+
+def expected_structure(spectrum: Spectrum, lag_m: FloatArray, cell_m: float) -> FloatArray:
+    """Return the mean squared height difference, m^2, at each lag on a floor of the spectrum."""
+    k, kernel = _structure_kernel(lag_m, cell_m)
+    power = 1 / (spectrum.p0 + spectrum.p1 * k**2 + spectrum.p2 * k**4)
+    return np.asarray(kernel @ power)
+
+
+def _structure_kernel(lag_m: FloatArray, cell_m: float) -> tuple[FloatArray, FloatArray]:
+    """Return wave numbers and the (lags, wave numbers) matrix from power to structure.
+
+    ``D(h) = 1/pi * integral of k P(k) (1 - J0(k h)) dk`` for an isotropic spectrum P.
+    """
+    k = np.geomspace(2 * np.pi / (40 * lag_m[-1]), 2 * np.pi / cell_m, 400)
+    return k, (1 - special.j0(np.outer(lag_m, k))) * k * np.gradient(k) / np.pi
 
 
 def random_floor(
