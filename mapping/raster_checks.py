@@ -8,8 +8,8 @@ from perception.records import BoolArray, FloatArray
 
 # What makers write for "no data" and forget to declare; no sea floor stands at these to the digit.
 _SENTINELS = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0)
-# Deeper than any sea and higher than any mountain: no height, whatever it stands for.
-_IMPOSSIBLE_M = 12_000.0
+# No height, whatever it stands for: makers fill with 1e20 or the largest float. (An odd datum may add millions.)
+_IMPOSSIBLE_M = 1e9
 # Hardly a height. Below it, as of a raster in centimetres, such a number may be one, and is none only where
 # it lies so many robust spreads from the nearest of the others.
 _HARDLY_M, _APART = 9_000.0, 10.0
