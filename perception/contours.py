@@ -33,9 +33,7 @@ class Roughness:
 
 
 # A floor at which the altimeter sees nothing still has ripples: 1 cm at 10 m.
-_LEAST_SCALE = 1e-5
-# Slopes beyond some 20 degrees over a third of the altitude are cliffs, which no variogram describes.
-_MOST_SLOPE_SQUARE = 0.15
+LEAST_SCALE = 1e-5
 
 
 def level_lines(
@@ -98,7 +96,7 @@ def learn_roughness(
     Lags run from a few pings to `reach_m` or half the pass, evenly in their logarithm. `between_objects` learns
     it by medians: of most of the ground, whatever objects under the track or a cliff add.
     """
-    half_square = _half_median_square if between_objects else _half_square
+    half = _half_median_square if between_objects else half_square
     known = np.isfinite(floor_m)
     floor, along = floor_m[known], along_m[known]
     if len(floor) < 8 or np.ptp(along) <= 0:
@@ -110,20 +108,20 @@ def learn_roughness(
     top = min(max(reach_m, 4 * step), 0.5 * length)
     lags = np.unique(np.geomspace(1, max(2, top / step), 14).astype(int))
     lags = lags[lags < len(even)]
-    values = np.array([half_square(even[k:] - even[:-k]) for k in lags])
+    values = np.array([half(even[k:] - even[:-k]) for k in lags])
     values = np.maximum(values - noise, 0.05 * values) + 1e-12
     counts = len(even) / lags
     # Far lags have few independent pairs; near ones are mostly noise.
     weights = np.sqrt(np.minimum(counts, 50) * values / (values + noise))
     if len(lags) < 2:
-        return Roughness(max(values[0] / (lags[0] * step), _LEAST_SCALE), 1.0)
+        return Roughness(max(values[0] / (lags[0] * step), LEAST_SCALE), 1.0)
     power, log_scale = np.polyfit(np.log(lags * step), np.log(values), 1, w=weights)
     power = float(np.clip(power, 0.2, 1.9))
     log_scale = float(np.average(np.log(values) - power * np.log(lags * step), weights=weights**2))
-    return Roughness(max(float(np.exp(log_scale)), _LEAST_SCALE), power)
+    return Roughness(max(float(np.exp(log_scale)), LEAST_SCALE), power)
 
 
-def _half_square(differences: FloatArray) -> float:
+def half_square(differences: FloatArray) -> float:
     """Return half the mean square of differences: the mean of a plain and of a robust estimate.
 
     Few large differences are objects under the track, which the plain mean takes for rough floor, or the
@@ -139,20 +137,6 @@ def _half_square(differences: FloatArray) -> float:
 def _half_median_square(differences: FloatArray) -> float:
     """Return half the mean square that normal differences with this median size would have."""
     return 0.5 * float(np.median(np.abs(differences)) / 0.6745) ** 2
-
-
-def least_range_bias(altitude_m: FloatArray, roughness: Roughness) -> tuple[FloatArray, FloatArray]:
-    """Return how much the least slant range falls short of the altitude, and the 1-sigma of that.
-
-    A floor of slope s has its least range at ``altitude cos(s)``, short by about ``altitude s^2 / 2``. The
-    slopes across the track are not seen, but over a third of the altitude they are as large as those
-    along it, whose mean square the variogram gives: ``2 gamma(l) / l^2``. Both returned arrays have
-    the shape of `altitude_m` (metres).
-    """
-    lag = np.maximum(altitude_m / 3, 0.1)
-    slope_square = np.minimum(2 * roughness.variogram(lag) / lag**2, _MOST_SLOPE_SQUARE)
-    # The square of a normal slope has a standard deviation of sqrt(2) times its mean.
-    return 0.5 * altitude_m * slope_square, altitude_m * slope_square / np.sqrt(2)
 
 
 def floor_beside(

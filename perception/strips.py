@@ -18,13 +18,13 @@ from perception.contours import (
     Roughness,
     floor_beside,
     learn_roughness,
-    least_range_bias,
     level_lines,
 )
 from perception.gain import Equalised, GainConfig, equalise
 from perception.geometry import progress_along, resample_rows
 from perception.layover import layover_cells
 from perception.levels import LevelConfig, Levels, segment_levels
+from perception.nearest_return import shortfall
 from perception.objects import (
     ObjectConfig,
     ObjectRow,
@@ -79,7 +79,7 @@ class PassResult:
     strip : heights with sigma.
     floor : the same without the objects: what the soundings alone say.
     objects : objects and craters.
-    bottom : altitude, sigma, first return, validity per ping.
+    bottom : altitude, sigma of its first return, first return, validity per ping.
     echo : (port, starboard) equalised power ratio (n, m), 1 nominal; NaN no data.
     levels : (port, starboard) int8 labels (n, m): 0 nominal, 1 highlight, -1 shadow, -2 no data.
     sample_m : slant range of a sample of `echo` and `levels` (one for the whole pass; pings recorded
@@ -126,7 +126,8 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
             f"{swath.source or 'swath'}: pass {swath.pass_index} shows no bottom in "
             f"{swath.n_pings} pings; is this a side-scan channel?"
         )
-    along_m = progress_along(swath.easting_m, swath.northing_m, swath.time_s)
+    # To a micrometre: the last digits of large coordinates would tip fits of objects from one end to another.
+    along_m = np.round(progress_along(swath.easting_m, swath.northing_m, swath.time_s), 6)
     # Where nothing is known of the depth there is nothing to level either.
     swath, lead_m = levelled(replace(swath, depth_m=known_depth(swath)), tracked.first_return_m)
     lines = _level(swath, tracked, along_m, sample_m, port.shape[1])
@@ -148,7 +149,9 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
         strip=replace(strip, lead_m=lead_m, flags=cells),
         floor=replace(floor, lead_m=lead_m, flags=cells),
         objects=ObjectTable.of(rows),
-        bottom=BottomTrack(lines.altitude_m, lines.sigma_m, tracked.first_return_m, tracked.valid),
+        bottom=BottomTrack(
+            lines.altitude_m, lines.first_sigma_m, tracked.first_return_m, tracked.valid
+        ),
         echo=echo,
         levels=labels,
         sample_m=sample_m,
@@ -163,7 +166,8 @@ def build_strip(swath: Swath, config: StripConfig | None = None) -> PassResult:
 class _Lines:
     """The floor below the sonar, levelled over all lines of a pass: (n,) each.
 
-    `roughness` is the floor's, `ground` that of the floor between objects.
+    `sigma_m` is that of height and altitude, `first_sigma_m` that of the first return as a nearest point; `roughness` is
+    the floor's, `ground` that of the floor between objects.
     """
 
     along_m: FloatArray
@@ -171,6 +175,7 @@ class _Lines:
     sigma_m: FloatArray
     altitude_m: FloatArray
     first_return_m: FloatArray
+    first_sigma_m: FloatArray
     roughness: Roughness
     ground: Roughness
     reach_m: float
@@ -179,20 +184,23 @@ class _Lines:
 def _level(
     swath: Swath, bottom: BottomTrack, along_m: FloatArray, sample_m: float, samples: int
 ) -> _Lines:
-    """Level the lines of soundings at once; their least range is taken for what slopes make of it."""
+    """Level the lines of soundings at once; least ranges are lengthened by what a rough floor takes off."""
     depth_m, reach_m = swath.depth_m, sample_m * samples
     sounded = -(depth_m + bottom.altitude_m)
     rough = learn_roughness(sounded, bottom.sigma_m, along_m, reach_m)
-    short, short_sigma = least_range_bias(bottom.altitude_m, rough)
+    short, short_sigma = shortfall(bottom.first_return_m, depth_m, bottom.sigma_m, along_m, rough)
     # Where the two sides' first returns differ, part of it was found already.
     short = np.maximum(short - (bottom.altitude_m - bottom.first_return_m), 0.0)
     line_m, line_sigma = level_lines(sounded - short, bottom.sigma_m, along_m, rough)
     # Where within its sample the first echo began is the same unknown on every line: averaging many does
     # not take it away.
-    line_sigma = np.sqrt(line_sigma**2 + (0.3 * sample_m) ** 2 + short_sigma**2)
+    echo_sigma = np.hypot(line_sigma, 0.3 * sample_m)
+    line_sigma = np.hypot(echo_sigma, short_sigma)
+    # Who looks for the nearest point himself is spared the half of it.
+    first_sigma = np.hypot(echo_sigma, 0.5 * short_sigma)
     ground = learn_roughness(sounded, bottom.sigma_m, along_m, reach_m, between_objects=True)
-    return _Lines(along_m, line_m, line_sigma, -depth_m - line_m, bottom.first_return_m, rough,
-                  ground, reach_m)  # fmt: skip
+    return _Lines(along_m, line_m, line_sigma, -depth_m - line_m, bottom.first_return_m,
+                  first_sigma, rough, ground, reach_m)  # fmt: skip
 
 
 def _look(

@@ -28,7 +28,7 @@ from scenarios.passes import each_pass
 from scenarios.report.contacts import Contact, contacts_of, pictured
 
 # Part of every pass's key: raise it when the same echoes would give another strip, objects or contacts.
-_METHOD = 2
+_METHOD = 3
 # Registration compares strips on this part of its cell; finer columns stay on disk.
 _THIN = 0.6
 # As in `scenarios.survey_map`.
