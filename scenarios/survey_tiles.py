@@ -21,6 +21,7 @@ from mapping.fixes import PositionFix
 from mapping.fusion import default_cell, fuse
 from mapping.placed import PlacedStrip, position_variance
 from mapping.survey import correct_survey, tie_to_map
+from mapping.survey_check import steady
 from mapping.survey_records import CorrectedSurvey, SurveyConfig
 from mapping.textures import MatchConfig
 from mapping.tile_figures import map_figures
@@ -131,8 +132,9 @@ def map_tiles(
             pass
     passes = file_passes(survey, folder / "strips", identity(survey), progress=progress)
     thin = [one.thin for one in passes]
+    # Rounded as a survey in one piece rounds the cell it derives: else squares differ by a hair.
     config = SurveyConfig(
-        match=MatchConfig(cell_m=float(np.median([one.cell_m for one in passes])))
+        match=MatchConfig(cell_m=steady(float(np.median([one.cell_m for one in passes]))))
     )
     corrected = correct_survey(thin, fixes, config, progress=progress)
     if prior is not None:
