@@ -96,7 +96,7 @@ def learn_roughness(
     Lags run from a few pings to `reach_m` or half the pass, evenly in their logarithm. `between_objects` learns
     it by medians: of most of the ground, whatever objects under the track or a cliff add.
     """
-    half = _half_median_square if between_objects else half_square
+    half = half_median_square if between_objects else half_square
     known = np.isfinite(floor_m)
     floor, along = floor_m[known], along_m[known]
     if len(floor) < 8 or np.ptp(along) <= 0:
@@ -134,7 +134,7 @@ def half_square(differences: FloatArray) -> float:
     return 0.5 * (robust + 0.5 * float(np.mean(np.square(differences))))
 
 
-def _half_median_square(differences: FloatArray) -> float:
+def half_median_square(differences: FloatArray) -> float:
     """Return half the mean square that normal differences with this median size would have."""
     return 0.5 * float(np.median(np.abs(differences)) / 0.6745) ** 2
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from perception.contours import LEAST_SCALE, Roughness, half_square
+from perception.contours import LEAST_SCALE, Roughness, half_median_square
 from perception.records import FloatArray, IntArray
 
 # Random floors have this many cells an altitude, and as many in all each way; they repeat beyond.
@@ -78,7 +78,10 @@ def _local_roughness(
     told = lag_m[(lag_m > step) & (lag_m < length / 4)]
     if len(told) > 1:
         lag_m = told
-        value = np.array([half_square(_differences(height_m, along_m, k, step)) for k in lag_m])
+        # By medians: objects under the track would pass for rough floor, and lengthen every altitude.
+        value = np.array(
+            [half_median_square(_differences(height_m, along_m, k, step)) for k in lag_m]
+        )
         value = np.maximum(value - noise_m**2, 0.05 * value) + 1e-12
     power, _ = np.polyfit(np.log(lag_m), np.log(value), 1)
     power = float(np.clip(power, _LEAST_POWER, _MOST_POWER))
