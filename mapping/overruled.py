@@ -16,7 +16,7 @@ from mapping.flag_layer import mostly_clear, no_votes, rows_of, vote
 from mapping.gridding import Window
 from mapping.objects import MergedObjects
 from mapping.placed import PlacedStrip, boxes, placed
-from perception.records import BoolArray, ElevationStrip, FloatArray, Grid, IntArray
+from perception.records import BoolArray, ElevationStrip, Grid, IntArray
 
 # So many passes must have seen the footprint clearly, in so much of its cells: two against one.
 _PASSES, _SEEN = 2, 0.7
@@ -69,7 +69,8 @@ def _plain(grid: Grid, objects: MergedObjects, k: int) -> bool:
     """Tell whether the map, sure enough of it, shows nothing like the least height where the object may stand."""
     assert grid.sigma_m is not None
     reach = float(objects.radius_m[k] + objects.position_sigma_m[k])
-    east, north = (x - c[k] for x, c in zip(grid.centres(), _places(objects), strict=True))
+    east, north = grid.centres()
+    east, north = east - objects.easting_m[k], north - objects.northing_m[k]
     far = reach + grid.cell_m + _RING_M
     rows, cols = np.flatnonzero(np.abs(north) <= far), np.flatnonzero(np.abs(east) <= far)
     if not (len(rows) and len(cols)):
@@ -88,10 +89,6 @@ def _plain(grid: Grid, objects: MergedObjects, k: int) -> bool:
     inside &= known
     most = _LEFT * objects.height_m[k]
     return bool(rise[inside].max() < most and np.median(sigma[inside]) < most)
-
-
-def _places(objects: MergedObjects) -> tuple[FloatArray, FloatArray]:
-    return objects.easting_m, objects.northing_m
 
 
 def _saw(

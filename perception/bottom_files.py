@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.bottom import BottomTrack
-from perception.files import existing_file, write_text
+from perception.files import existing_file, utc_seconds, write_text
 from perception.records import BoolArray, FloatArray, InputError, IntArray, Swath
 
 # Rows this far from their pings in time belong to another record; clocks corrected otherwise differ by less.
@@ -144,17 +144,12 @@ def read_bottom(path: Path) -> GivenBottom:
 
 def _seconds(text: str | None) -> float:
     """Return a time in seconds since 1970, or of the file's clock; NaN where it is neither."""
-    text = (text or "").strip().removesuffix("Z")
-    try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
-        stamp = np.datetime64(text, "ms")
-    except ValueError:
-        return float("nan")
-    # numpy takes an empty text for no time, and that for a number far in the past.
-    return float("nan") if np.isnat(stamp) else float(stamp.astype(np.int64)) / 1000.0
+    for read in (float, utc_seconds):
+        try:
+            return read(text or "")
+        except ValueError:
+            continue
+    return float("nan")
 
 
 def _number(path: Path, line: int, name: str, text: str | None) -> float:

@@ -96,7 +96,7 @@ def learn_roughness(
     Lags run from a few pings to `reach_m` or half the pass, evenly in their logarithm. `between_objects` learns
     it by medians: of most of the ground, whatever objects under the track or a cliff add.
     """
-    half = half_median_square if between_objects else half_square
+    half = half_median_square if between_objects else _half_square
     known = np.isfinite(floor_m)
     floor, along = floor_m[known], along_m[known]
     if len(floor) < 8 or np.ptp(along) <= 0:
@@ -121,7 +121,7 @@ def learn_roughness(
     return Roughness(max(float(np.exp(log_scale)), LEAST_SCALE), power)
 
 
-def half_square(differences: FloatArray) -> float:
+def _half_square(differences: FloatArray) -> float:
     """Return half the mean square of differences: the mean of a plain and of a robust estimate.
 
     Few large differences are objects under the track, which the plain mean takes for rough floor, or the

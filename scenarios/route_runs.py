@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from perception.files import read_toml
 from perception.records import InputError, NoPathError
 from scenarios.commands.console import print_table
 from scenarios.outputs import write_metrics
@@ -230,9 +230,9 @@ def _tell_of_forgotten(run: Run, old_route: Path) -> None:
     if not path.is_file():
         return
     try:
-        old = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        logger.warning("%s: cannot tell what the old route was held by (%s)", path, error)
+        old = read_toml(path)
+    except InputError as error:
+        logger.warning("cannot tell what the old route was held by: %s", error)
         return
     for key, option in _HELD_BY.items():
         if old.get(key) and not getattr(run.given, key):
