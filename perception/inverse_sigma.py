@@ -9,7 +9,8 @@ from scipy import ndimage
 
 from perception.bands import in_threads
 from perception.inverse_state import Solved, State, linear_problem, present_soundings
-from perception.posterior import Fields, Problem
+from perception.multigrid import Fields
+from perception.posterior import Problem
 from perception.profiles import uncrossed
 from perception.rays import Soundings
 from perception.records import FloatArray

@@ -285,24 +285,27 @@ def restrict_rows(first, last, fine, coarse):
             coarse[i, j + 1] += half * line[2 * j + 1]
 
 
+@njit(inline="always")
+def row_times(i, start, column, value, z):
+    """Return what row i of a sparse matrix makes of `z`."""
+    total = 0.0
+    for k in range(start[i], start[i + 1]):
+        total += value[k] * z[column[k]]
+    return total
+
+
 @njit(cache=True, nogil=True)
 def read_equations(first, last, start, column, value, weight, z, out):
     """Write `weight` times what equations [first, last), rows of a sparse matrix, make of `z` (nodes,)."""
     for i in range(first, last):
-        total = 0.0
-        for k in range(start[i], start[i + 1]):
-            total += value[k] * z[column[k]]
-        out[i] = weight[i] * total
+        out[i] = weight[i] * row_times(i, start, column, value, z)
 
 
 @njit(cache=True, nogil=True)
 def spread_equations(first, last, start, column, value, nodes, read, out):
     """Add to the nodes [first, last) of `nodes` what the transpose makes of `read` (equations,)."""
     for i in range(first, last):
-        total = 0.0
-        for k in range(start[i], start[i + 1]):
-            total += value[k] * read[column[k]]
-        out[nodes[i]] += total
+        out[nodes[i]] += row_times(i, start, column, value, read)
 
 
 @njit(cache=True, fastmath=True, nogil=True)

@@ -18,7 +18,7 @@ from scipy import linalg, sparse
 from perception.bands import over_bands
 from perception.coupling import Coupling
 from perception.level_kernels import prior_rows
-from perception.multigrid import Hierarchy, Spectrum, Tie, add_times, can_halve, dot
+from perception.multigrid import Fields, Hierarchy, Spectrum, Tie, add_times, can_halve, dot
 from perception.records import FloatArray, IntArray
 from perception.stencils import (
     accumulate_moments,
@@ -37,8 +37,6 @@ _PATCH = 50_000
 _SLOW = 0.05
 # Blocks of data rows whose pull on the gains is summed apart: the same sums however many threads share them.
 _BLOCKS = 32
-# Heights, log-albedo and gains.
-Fields = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def add_prior_noise(
