@@ -11,23 +11,20 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
 from mapping.comparison_memory import QUICK, SETTLED, ComparisonMemory
 from mapping.fixes import PositionFix
-from mapping.pose_graph import Solution
+from mapping.pose_graph import Solution, trusted
 from mapping.pose_graph_incremental import IncrementalGraph
 from mapping.pose_graph_solve import with_range_scale
 from mapping.survey import assemble, correct_survey
 from mapping.survey_check import check
 from mapping.survey_records import CorrectedSurvey, Round, SurveyConfig
-from perception.records import BoolArray, ElevationStrip, Progress, silent
+from perception.records import ElevationStrip, Progress, silent
 
 logger = logging.getLogger(__name__)
-
-_Factor = TypeVar("_Factor")
 
 
 def pass_by_pass(
@@ -116,9 +113,9 @@ class IncrementalSurvey:
             self._graph = IncrementalGraph(batch.config, absolute)
         self._graph.add_passes(survey.keyframes)
         self._graph.hold(
-            _used(survey.links, batch.link_used),
-            _used(survey.ties, batch.fix_used),
-            _used(survey.steps, batch.step_used),
+            trusted(survey.links, batch.link_used),
+            trusted(survey.ties, batch.fix_used),
+            trusted(survey.steps, batch.step_used),
         )
         found = self._graph.solution()
         updated = replace(
@@ -131,10 +128,6 @@ class IncrementalSurvey:
             height_sigma_m=found.height_sigma_m,
         )
         return with_range_scale(updated, survey.keyframes, survey.links, survey.ties)
-
-
-def _used(factors: Sequence[_Factor], used: BoolArray) -> list[_Factor]:
-    return [x for x, ok in zip(factors, used, strict=True) if ok]
 
 
 def _of_pass(progress: Progress, number: int) -> Progress:

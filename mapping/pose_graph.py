@@ -7,9 +7,9 @@ docs/pose-graph.md has the derivation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import gtsam as typed_gtsam
 import numpy as np
@@ -22,10 +22,13 @@ from perception.records import BoolArray, FloatArray
 # The stubs of the wheel know neither KeyVector arguments nor overloads by noise model.
 gtsam: Any = typed_gtsam
 
+_Factor = TypeVar("_Factor")
+# Keys with their matrices, then a noise model: what `jacobian` takes.
+_Terms = tuple[Any, ...]
 
 # The tie between a keyframe and the ground that it saw is exact; a centimetre is below any registration and
 # keeps the system well-conditioned beside a start that is free by a hundred metres.
-TIE_M = 1e-2
+_TIE_M = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +67,6 @@ class GraphConfig:
     def walk_m2_per_m(self) -> float:
         """Variance (m2 an axis) of the random walk for each metre of way."""
         return self.drift_m_per_sqrt_km**2 / 1000.0
-
-    @property
-    def rate2(self) -> float:
-        """Variance (an axis) by which a pass's scale and course errors carry it off, for each square metre of way."""
-        return float(self.scale**2 + np.radians(self.heading_bias_deg) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +158,15 @@ def perpendicular(vector: FloatArray) -> FloatArray:
     return np.stack([vector[..., 1], -vector[..., 0]], axis=-1)
 
 
+def trusted(factors: Sequence[_Factor], used: BoolArray) -> tuple[_Factor, ...]:
+    """Return the factors that a solution used, or whatever else a mask of the same length keeps."""
+    return tuple(x for x, ok in zip(factors, used, strict=True) if ok)
+
+
 def solution_of(
     keyframes: Keyframes,
-    vector_at: Callable[[int], FloatArray],
-    covariance_of: Callable[[int], FloatArray] | None,
+    values_of: Callable[[list[int]], FloatArray] | None,
+    covariances_of: Callable[[list[int]], FloatArray] | None,
     config: GraphConfig,
     *,
     link_used: BoolArray,
@@ -171,32 +174,40 @@ def solution_of(
     step_used: BoolArray,
     error_before: float,
     error_after: float,
-    indeterminate: bool = False,
+    root: Root | None = None,
 ) -> Solution:
-    """Collect a solution from a solver's estimate and marginal covariance of each key (None: unknown)."""
+    """Collect a solution from what a solver says of variables of one size.
+
+    Parameters
+    ----------
+    values_of, covariances_of : values (k, d) and marginal covariances (k, d, d) of some keys; None of a graph that
+        does not determine them: no correction, and NaN.
+    """
     passes = range(len(keyframes.starts) - 1)
-
-    def covariance(key: int, size: int) -> FloatArray:
-        if covariance_of is None:
-            return np.full((size, size), np.nan)
-        return np.asarray(covariance_of(key))
-
-    strip_cov = [covariance(B(p), 3) for p in passes]
+    groups = [
+        ([E(k) for k in range(len(keyframes))], 2), ([B(p) for p in passes], 3), ([H(p) for p in passes], 1)
+    ]  # fmt: skip
+    found, spread = [], []
+    for keys, d in groups:
+        found.append(np.zeros((len(keys), d)) if values_of is None else values_of(keys))
+        nothing = np.full((len(keys), d, d), np.nan)
+        spread.append(nothing if covariances_of is None else covariances_of(keys))
     return Solution(
-        correction_m=np.array([vector_at(E(k)) for k in range(len(keyframes))]),
-        covariance_m2=np.array([covariance(E(k), 2) for k in range(len(keyframes))]),
-        pass_errors=np.array([vector_at(B(p)) for p in passes]),
-        pass_sigma=np.sqrt(np.array([np.diag(c) for c in strip_cov])),
-        height_m=np.array([vector_at(H(p))[0] for p in passes]),
-        height_sigma_m=np.sqrt(np.array([covariance(H(p), 1)[0, 0] for p in passes])),
+        correction_m=found[0],
+        covariance_m2=spread[0],
+        pass_errors=found[1],
+        pass_sigma=np.sqrt(np.diagonal(spread[1], axis1=1, axis2=2)),
+        height_m=found[2][:, 0],
+        height_sigma_m=np.sqrt(spread[2][:, 0, 0]),
         link_used=link_used,
         fix_used=fix_used,
         step_used=step_used,
         error_before=error_before,
         error_after=error_after,
-        indeterminate=indeterminate,
+        indeterminate=values_of is None,
         worsened=bool(error_after > error_before * (1 + 1e-9) + 1e-9),
         config=config,
+        root=root,
     )
 
 
@@ -210,7 +221,8 @@ def build(
     """Return the graph, its start (no correction) and the indices of factors that may be wrong."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     add_passes(graph, values, keyframes, config)
-    add_odometry(graph, values, keyframes, config, absolute=bool(fixes))
+    add_starts(graph, values, keyframes, config, absolute=bool(fixes))
+    add_odometry(graph, keyframes, config)
     doubtful: list[int] = []
     for number, link in enumerate(links):
         doubtful.append(add_link(graph, values, keyframes, link, number))
@@ -266,27 +278,10 @@ def same_dive(keyframes: Keyframes) -> BoolArray:
     return np.isfinite(keyframes.way_m[keyframes.starts[:-1]])
 
 
-def add_odometry(
-    graph: Any,
-    values: Any,
-    keyframes: Keyframes,
-    config: GraphConfig,
-    absolute: bool,
-    first: int = 0,
-) -> None:
-    """Add corrections from keyframe `first` on and the way between (`ways`)."""
-    add_starts(graph, values, keyframes, config, absolute, first)
-    effects, sigma_m = ways(keyframes, config)
-    for k in range(first, len(keyframes)):
-        if np.isfinite(sigma_m[k]):
-            graph.add(
-                _linear(
-                    (E(k - 1), -np.eye(2)),
-                    (E(k), np.eye(2)),
-                    (B(int(keyframes.strip[k - 1])), -effects[k]),
-                    gtsam.noiseModel.Isotropic.Sigma(2, sigma_m[k]),
-                )
-            )
+def add_odometry(graph: Any, keyframes: Keyframes, config: GraphConfig, first: int = 0) -> None:
+    """Add the way to each keyframe from `first` on."""
+    for terms in way_terms(keyframes, config, first):
+        graph.add(_linear(*terms))
 
 
 def add_starts(
@@ -306,71 +301,87 @@ def add_starts(
             graph.add(gtsam.PriorFactorVector(E(k), np.zeros(2), start))
 
 
-def ways(keyframes: Keyframes, config: GraphConfig) -> tuple[FloatArray, FloatArray]:
-    """Return (k, 2, 3) what pass errors do to the way from the keyframe before, and (k,) the walk's 1-sigma on it.
+def way_terms(keyframes: Keyframes, config: GraphConfig, first: int = 0) -> Iterator[_Terms]:
+    """Yield what ties each keyframe from `first` on to the one before, where a way leads from there.
 
-    e[k] - e[k-1] = scale * d + bias * perpendicular(d) + walk, with d the navigation's step. NaN where no way leads.
+    e[k] - e[k-1] = scale * d + bias * perpendicular(d) + walk, with d the navigation's step.
     """
     position = np.column_stack([keyframes.easting_m, keyframes.northing_m])
     step = np.diff(position, axis=0, prepend=position[:1])
     effects = np.stack([step, perpendicular(step), np.zeros_like(step)], axis=-1)
     walk_m = config.drift_m_per_sqrt_km * np.sqrt(keyframes.way_m / 1000.0)
-    return effects, np.maximum(np.hypot(walk_m, keyframes.jump_m), 1e-3)
+    sigma_m = np.maximum(np.hypot(walk_m, keyframes.jump_m), 1e-3)
+    for k in range(first, len(keyframes)):
+        if np.isfinite(sigma_m[k]):
+            yield (
+                (E(k - 1), -np.eye(2)),
+                (E(k), np.eye(2)),
+                (B(int(keyframes.strip[k - 1])), -effects[k]),
+                gtsam.noiseModel.Isotropic.Sigma(2, sigma_m[k]),
+            )
 
 
-def add_link(graph: Any, values: Any, keyframes: Keyframes, link: Link, number: int) -> int:
-    """Add the two patches of ground and the registration between them; return its factor's index."""
-    tie = gtsam.noiseModel.Isotropic.Sigma(2, TIE_M)
+def tie_terms(keyframes: Keyframes, link: Link, number: int = 0) -> Iterator[tuple[int, _Terms]]:
+    """Yield the variables that a registration brings, each with what ties it to its pass.
+
+    They are the two patches of ground, ``G(2 number)`` and the one after, and before each, where two keyframes stand for
+    a pass, their mean M.
+    """
+    tie = gtsam.noiseModel.Isotropic.Sigma(2, _TIE_M)
     ends = (
         (link.first, link.first_blend, link.first_offset_m),
         (link.second, link.second_blend, link.second_offset_m),
     )
     for side, (k, blend, offset) in enumerate(ends):
-        ground = G(2 * number + side)
-        values.insert(ground, np.zeros(2))
-        correction = _mean_correction(graph, values, blend, 2 * number + side) or E(k)
+        correction, ground = E(k), G(2 * number + side)
+        if blend is not None and blend.low != blend.high:
+            correction = M(2 * number + side)
+            yield (
+                correction,
+                (
+                    (E(blend.low), (blend.share - 1.0) * np.eye(2)),
+                    (E(blend.high), -blend.share * np.eye(2)),
+                    (correction, np.eye(2)),
+                    tie,
+                ),
+            )
         # A wrong heading of the sonar swings the ground about the vehicle.
         swing = np.column_stack([np.zeros((2, 2)), perpendicular(offset)])
-        graph.add(
-            _linear(
+        yield (
+            ground,
+            (
                 (correction, -np.eye(2)),
-                (ground, np.eye(2)),
                 (B(int(keyframes.strip[k])), -swing),
+                (ground, np.eye(2)),
                 tie,
-            )
+            ),
         )
+
+
+def add_link(graph: Any, values: Any, keyframes: Keyframes, link: Link, number: int) -> int:
+    """Add the two patches of ground and the registration between them; return its factor's index."""
+    for brought, terms in tie_terms(keyframes, link, number):
+        values.insert(brought, np.zeros(2))
+        graph.add(_linear(*terms))
     noise = gtsam.noiseModel.Gaussian.Covariance(link.covariance_m2)
     graph.add(gtsam.BetweenFactorVector(G(2 * number), G(2 * number + 1), link.shift_m, noise))
     return int(graph.size()) - 1
 
 
-def _mean_correction(graph: Any, values: Any, blend: Blend | None, number: int) -> int | None:
-    """Add the weighted mean of two corrections as a variable and return its key; None where one tells all."""
-    if blend is None or blend.low == blend.high:
-        return None
-    mean = M(number)
-    values.insert(mean, np.zeros(2))
-    graph.add(
-        _linear(
-            (E(blend.low), (blend.share - 1.0) * np.eye(2)),
-            (E(blend.high), -blend.share * np.eye(2)),
-            (mean, np.eye(2)),
-            gtsam.noiseModel.Isotropic.Sigma(2, TIE_M),
-        )
-    )
-    return int(mean)
+def jacobian(*terms: Any) -> Any:
+    """Return the native linear factor ``sum A_i x_i = 0`` of (key, matrix) terms and a noise model."""
+    *blocks, noise = terms
+    flat = [part for block in blocks for part in block]
+    return gtsam.JacobianFactor(*flat, np.zeros(blocks[0][1].shape[0]), noise)
 
 
 def _linear(*terms: Any) -> Any:
-    """Return the native factor ``sum A_i x_i = 0`` of (key, matrix) terms and a noise model."""
-    *blocks, noise = terms
-    flat = [part for block in blocks for part in block]
+    """Return the same as a factor of a graph that need not be linear."""
     # Without a linearisation point GTSAM reads a linear factor as one in increments, not in values.
     at = gtsam.Values()
-    for key, matrix in blocks:
+    for key, matrix in terms[:-1]:
         at.insert(key, np.zeros(matrix.shape[1]))
-    rows = blocks[0][1].shape[0]
-    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(*flat, np.zeros(rows), noise), at)
+    return gtsam.LinearContainerFactor(jacobian(*terms), at)
 
 
 def gauss_newton() -> Any:

@@ -19,6 +19,7 @@ from mapping.pose_graph import (
     add_link,
     add_odometry,
     add_passes,
+    add_starts,
     add_step,
     solution_of,
 )
@@ -62,7 +63,8 @@ class IncrementalGraph:
             graph, values, keyframes, self._config, 0 if known is None else len(known.starts) - 1
         )
         first = 0 if known is None else len(known)
-        add_odometry(graph, values, keyframes, self._config, self._absolute, first)
+        add_starts(graph, values, keyframes, self._config, self._absolute, first)
+        add_odometry(graph, keyframes, self._config, first)
         if graph.size():
             self._isam.update(graph, values)
         self._keyframes = keyframes
@@ -114,8 +116,8 @@ class IncrementalGraph:
         links, fixes, steps = (np.ones(size, bool) for size in self._sizes)
         return solution_of(
             self._keyframes,
-            estimate.atVector,
-            isam.marginalCovariance,
+            lambda keys: np.array([estimate.atVector(key) for key in keys]),
+            lambda keys: np.array([isam.marginalCovariance(key) for key in keys]),
             self._config,
             link_used=links,
             fix_used=fixes,

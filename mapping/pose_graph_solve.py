@@ -15,12 +15,11 @@ from typing import Any
 
 import gtsam as typed_gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, E, G, H, M
+from gtsam.symbol_shorthand import E, G
 from scipy.stats import chi2
 
 from mapping.keyframes import KeyframeFix, Keyframes
 from mapping.pose_graph import (
-    TIE_M,
     GraphConfig,
     HeightStep,
     Link,
@@ -29,9 +28,12 @@ from mapping.pose_graph import (
     add_passes,
     add_starts,
     add_step,
-    perpendicular,
+    jacobian,
     same_dive,
-    ways,
+    solution_of,
+    tie_terms,
+    trusted,
+    way_terms,
 )
 from mapping.pose_graph_root import Root
 from perception.records import BoolArray, FloatArray
@@ -72,7 +74,8 @@ class LinearGraph:
         for fix in fixes:
             add_fix(graph, fix)
         linear = graph.linearize(values)
-        self._sure = [linear.at(i) for i in range(sure)] + _way_factors(keyframes, config)
+        self._sure = [linear.at(i) for i in range(sure)]
+        self._sure += [jacobian(*terms) for terms in way_terms(keyframes, config)]
         self.doubtful = [_link_factor(keyframes, link) for link in links]
         self.doubtful += [linear.at(i) for i in range(sure, linear.size())]
         # The weight that each carries now: GTSAM holds it as a noise model.
@@ -133,46 +136,12 @@ class LinearGraph:
         return left_over, left_over.optimize()
 
 
-def _way_factors(keyframes: Keyframes, config: GraphConfig) -> list[Any]:
-    """Return the way between keyframes, as `pose_graph.add_odometry` has it."""
-    effects, sigma_m = ways(keyframes, config)
-    eye, nothing = np.eye(2), np.zeros(2)
-    return [
-        gtsam.JacobianFactor(
-            E(k - 1), -eye, E(k), eye, B(int(keyframes.strip[k - 1])), -effects[k], nothing,
-            gtsam.noiseModel.Isotropic.Sigma(2, sigma_m[k]),
-        )
-        for k in np.flatnonzero(np.isfinite(sigma_m)).tolist()
-    ]  # fmt: skip
-
-
 def _link_factor(keyframes: Keyframes, link: Link) -> Any:
     """Return a registration as one factor between keyframes and pass errors, its own variables eliminated."""
     graph, inner = gtsam.GaussianFactorGraph(), gtsam.Ordering()
-    eye, nothing = np.eye(2), np.zeros(2)
-    tie = gtsam.noiseModel.Isotropic.Sigma(2, TIE_M)
-    ends = (
-        (link.first, link.first_blend, link.first_offset_m),
-        (link.second, link.second_blend, link.second_offset_m),
-    )
-    for side, (k, blend, offset) in enumerate(ends):
-        mean = E(k)
-        if blend is not None and blend.low != blend.high:
-            mean = M(side)
-            graph.add(
-                gtsam.JacobianFactor(
-                    E(blend.low), (blend.share - 1.0) * eye, E(blend.high), -blend.share * eye,
-                    mean, eye, nothing, tie,
-                )
-            )  # fmt: skip
-            inner.push_back(mean)
-        swing = np.column_stack([np.zeros((2, 2)), perpendicular(offset)])
-        graph.add(
-            gtsam.JacobianFactor(
-                mean, -eye, B(int(keyframes.strip[k])), -swing, G(side), eye, nothing, tie
-            )
-        )
-        inner.push_back(G(side))
+    for brought, terms in tie_terms(keyframes, link):
+        graph.add(jacobian(*terms))
+        inner.push_back(brought)
     white = np.linalg.inv(np.linalg.cholesky(link.covariance_m2))
     unit = gtsam.noiseModel.Unit.Create(2)
     graph.add(gtsam.JacobianFactor(G(0), -white, G(1), white, white @ link.shift_m, unit))
@@ -273,14 +242,9 @@ def with_range_scale(
         return solution
     pulls = [
         replace(link, shift_m=_range_effect(keyframes, link))
-        for link, used in zip(links, solution.link_used, strict=True)
-        if used
+        for link in trusted(links, solution.link_used)
     ]
-    still = [
-        replace(fix, correction_m=np.zeros(2))
-        for fix, used in zip(fixes, solution.fix_used, strict=True)
-        if used
-    ]
+    still = [replace(fix, correction_m=np.zeros(2)) for fix in trusted(fixes, solution.fix_used)]
     # Heights have no part in it.
     linear = LinearGraph(keyframes, pulls, still, config)
     try:
@@ -336,32 +300,14 @@ def _solution(
     link_used: BoolArray, fix_used: BoolArray, step_used: BoolArray,
 ) -> Solution:  # fmt: skip
     """Put an answer and its covariances into the survey's terms; without an answer, no correction and NaN."""
-    passes = range(len(keyframes.starts) - 1)
-    keys = [[E(k) for k in range(len(keyframes))], [B(p) for p in passes], [H(p) for p in passes]]
-    root = None
-    if values is None:
-        found = [np.zeros((len(k), d)) for k, d in zip(keys, (2, 3, 1), strict=True)]
-        covariance = [np.full((len(k), d, d), np.nan) for k, d in zip(keys, (2, 3, 1), strict=True)]
-        before = after = float("nan")
-    else:
+    root, before, after = None, float("nan"), float("nan")
+    if values is not None:
         root = Root.of(net)
-        found = [np.array([values.at(key) for key in group]) for group in keys]
-        covariance = [root.covariances(group) for group in keys]
         before, after = graph.error(gtsam.VectorValues.Zero(values)), graph.error(values)
-    return Solution(
-        correction_m=found[0],
-        covariance_m2=covariance[0],
-        pass_errors=found[1],
-        pass_sigma=np.sqrt(np.diagonal(covariance[1], axis1=1, axis2=2)),
-        height_m=found[2][:, 0],
-        height_sigma_m=np.sqrt(covariance[2][:, 0, 0]),
-        link_used=link_used,
-        fix_used=fix_used,
-        step_used=step_used,
-        error_before=before,
-        error_after=after,
-        indeterminate=values is None,
-        worsened=bool(after > before * (1 + 1e-9) + 1e-9),
-        config=config,
-        root=root,
-    )
+    return solution_of(
+        keyframes,
+        None if values is None else lambda keys: np.array([values.at(key) for key in keys]),
+        None if root is None else root.covariances,
+        config, link_used=link_used, fix_used=fix_used, step_used=step_used,
+        error_before=before, error_after=after, root=root,
+    )  # fmt: skip

@@ -25,9 +25,6 @@ from perception.records import ElevationStrip, FloatArray, Grid, Progress
 
 # More than two gain little: gathering is short and the rest holds the lock.
 _THREADS = 2
-# What is expected of any shift beneath what the graph can know, 1-sigma an axis: beams, rocking, the floor that
-# places echoes.
-LEAST_SHIFT_M = 0.5
 # Cells of the floor that places echoes: some hundred bytes each while passes are fused. At a sixth of an
 # altitude of 15 m they are 25 km2, and at the width it is smoothed to, 0.4 altitudes, 140 km2.
 _FLOOR_CELLS = 4_000_000
@@ -70,7 +67,7 @@ def register(
     floor: Grid | None,
     progress: Progress,
     label: str,
-    expected: FloatArray | None = None,
+    expected: FloatArray,
     memory: ComparisonMemory | None = None,
 ) -> tuple[list[tuple[Window, Match]], list[Link]]:
     """Compare the passes over every window; return every comparison, and a link for each accepted one.
@@ -79,24 +76,43 @@ def register(
     ----------
     corrected : the strips on the track of `solution`.
     floor : a map that tells where echoes came from; None what the strips' soundings say of it.
-    expected : (windows, 2, 2) covariance of the shift expected beforehand; None what `expected_shift` says.
+    expected : (windows, 2, 2) covariance of the shift expected beforehand.
     memory : of earlier comparisons; those that hold still are not made again.
     """
-    if expected is None:
-        expected = np.array(
-            [expected_shift(keyframes, solution, *ends_of(keyframes, w), graph) for w in windows]
-        )
     known = known_floor(corrected) if floor is None else floor
     given = Circumstances(windows, corrected, keyframes, solution, expected, known, cell_m)
     recalled = {} if memory is None else memory.recall(given)
+    made = _compared(given, recalled, textures, config, widest_search_m, progress, label)
+    matches = [made[number] for number in range(len(windows))]
+    if memory is not None:
+        memory.keep(given, recalled, matches)
+    results = list(zip(windows, believed(matches), strict=True))
+    seen = {index for w, m in results if m.accepted for index in (w.first, w.second)}
+    facts = {index: PassFacts.of(corrected[index]) for index in seen}
+
+    def link(window: Window, result: Match) -> Link:
+        def make() -> Link:
+            return link_of(corrected, facts, keyframes, solution, window, result, graph, floor)
+
+        return make() if memory is None else memory.link(window, cell_m, make)
+
+    return results, [link(window, result) for window, result in results if result.accepted]
+
+
+def _compared(
+    given: Circumstances, recalled: dict[int, Match], textures: TextureStore, config: MatchConfig,
+    widest_search_m: float, progress: Progress, label: str,
+) -> dict[int, Match]:  # fmt: skip
+    """Return what the windows' squares say, by the windows' numbers: as recalled, the others compared now."""
+    windows, cell_m = given.windows, given.cell_m
     fresh = [i for i in range(len(windows)) if i not in recalled]
     needed = sorted({i for n in fresh for i in (windows[n].first, windows[n].second)})
     with ThreadPoolExecutor(_THREADS) as pool:
-        ready = pool.map(lambda index: textures.placed(index, corrected[index], known), needed)
+        ready = pool.map(lambda i: textures.placed(i, given.strips[i], given.floor), needed)
         placed = dict(zip(needed, ready, strict=True))
 
     def compare(number: int) -> Match:
-        window, prior = windows[number], expected[number]
+        window, prior = windows[number], given.expected[number]
         search_m = 3.0 * float(np.sqrt(np.linalg.eigvalsh(prior).max())) + 2.0 * cell_m
         return match(
             placed[window.first],
@@ -115,20 +131,7 @@ def register(
         for number, result in zip(fresh, pool.map(compare, fresh), strict=True):
             made[number] = result
             progress(label, len(made), len(windows))
-    matches = [made[number] for number in range(len(windows))]
-    if memory is not None:
-        memory.keep(given, recalled, matches)
-    results = list(zip(windows, believed(matches), strict=True))
-    seen = {index for w, m in results if m.accepted for index in (w.first, w.second)}
-    facts = {index: PassFacts.of(corrected[index]) for index in seen}
-
-    def link(window: Window, result: Match) -> Link:
-        def make() -> Link:
-            return link_of(corrected, facts, keyframes, solution, window, result, graph, floor)
-
-        return make() if memory is None else memory.link(window, cell_m, make)
-
-    return results, [link(window, result) for window, result in results if result.accepted]
+    return made
 
 
 def ends_of(keyframes: Keyframes, window: Window) -> tuple[int, int]:
@@ -173,28 +176,3 @@ def affordable_cell(
     window = extent([strip_placed(strip) for strip in strips], cell_m)
     cells = 0 if window is None else window.rows * window.cols
     return cell_m * max(1.0, float(np.sqrt(cells / most)))
-
-
-def expected_shift(
-    keyframes: Keyframes, solution: Solution, first: int, second: int, config: GraphConfig
-) -> FloatArray:
-    """Return the (2, 2) covariance of the shift between two keyframes expected beforehand.
-
-    The lesser of what the two corrections' covariances allow and what the way between allows: errors from
-    before the first of the two are common to both.
-    """
-    both = solution.covariance_m2[first] + solution.covariance_m2[second]
-    low, high = sorted((first, second))
-    way = keyframes.way_m[low + 1 : high + 1]
-    if np.isfinite(way).all():
-        walk = config.walk_m2_per_m * way.sum()
-        jump = (keyframes.jump_m[low + 1 : high + 1] ** 2).sum()
-        steps = np.hypot(
-            np.diff(keyframes.easting_m[low : high + 1]),
-            np.diff(keyframes.northing_m[low : high + 1]),
-        )
-        by_pass = np.bincount(keyframes.strip[low:high] - keyframes.strip[low], weights=steps)
-        between = (walk + jump + config.rate2 * (by_pass**2).sum()) * np.eye(2)
-        if not np.isfinite(both).all() or np.trace(between) < np.trace(both):
-            both = between
-    return np.where(np.isfinite(both), both, 1e4 * np.eye(2)) + LEAST_SHIFT_M**2 * np.eye(2)

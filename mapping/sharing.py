@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from mapping.keyframes import KeyframeFix, Keyframes
-from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution
+from mapping.pose_graph import GraphConfig, HeightStep, Link, Solution, trusted
 from mapping.pose_graph_solve import LinearGraph, consistent, log_evidence, solve, with_range_scale
 
 logger = logging.getLogger(__name__)
@@ -78,9 +78,9 @@ def _most_evident(
     first = solve(keyframes, links, fixes, config, steps=steps)
     if len(keyframes.starts) < 3:
         return first
-    used_links = [x for x, ok in zip(links, first.link_used, strict=True) if ok]
-    used_fixes = [x for x, ok in zip(fixes, first.fix_used, strict=True) if ok]
-    used_steps = [x for x, ok in zip(steps, first.step_used, strict=True) if ok]
+    used_links = trusted(links, first.link_used)
+    used_fixes = trusted(fixes, first.fix_used)
+    used_steps = trusted(steps, first.step_used)
     config = replace(config, height_m=height_size(used_steps, len(keyframes.starts) - 1, config))
     best, most = config.shared, float("-inf")
     for shared in _CORRELATIONS:

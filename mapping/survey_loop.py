@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,20 +14,18 @@ from mapping.keyframes import KeyframeFix, Keyframes
 from mapping.link_choice import enough, without
 from mapping.overlaps import Window, find_overlaps
 from mapping.placing import on_track
-from mapping.pose_graph import HeightStep, Link, Solution
+from mapping.pose_graph import HeightStep, Link, Solution, trusted
 from mapping.pose_graph_relative import relative_covariance
 from mapping.pose_graph_solve import solve
-from mapping.rounds import LEAST_SHIFT_M, Registration, TextureStore, ends_of, register
+from mapping.rounds import Registration, TextureStore, ends_of, register
 from mapping.survey_check import least_square_m, square_cell_m
 from mapping.survey_records import CorrectedSurvey, Round, SurveyConfig
-from perception.records import BoolArray, ElevationStrip, FloatArray, Grid, Progress
+from perception.records import ElevationStrip, FloatArray, Grid, Progress
 
 logger = logging.getLogger(__name__)
 
 # Rounds of one square's width beyond the first, where passes come within reach one after the other.
 _MORE_ROUNDS = 3
-
-_Factor = TypeVar("_Factor")
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +91,8 @@ def _begun(given: Given, known: CorrectedSurvey | None) -> State:
     return State(
         known.solution, known.diagnostics.rounds, known.registrations,
         tuple(zip(known.squares, known.links, strict=True)),
-        _trusted(known.links, known.solution.link_used),
-        _trusted(known.steps, known.solution.step_used),
+        trusted(known.links, known.solution.link_used),
+        trusted(known.steps, known.solution.step_used),
     )  # fmt: skip
 
 
@@ -152,16 +149,12 @@ def _round(
     )
     logger.info("round %d: %s", len(state.rounds) + 1, said)
     believed_here = zip((r.window for r in found if r.match.accepted), links, strict=True)
-    kept = _trusted(tuple(believed_here), after.link_used)
+    kept = trusted(tuple(believed_here), after.link_used)
     pool = state.pool[: len(state.pool) - len(held)]
     return State(
         after, (*state.rounds, said), found, (*pool, *kept), tuple(x for _, x in kept),
-        _trusted(steps, after.step_used),
+        trusted(steps, after.step_used),
     )  # fmt: skip
-
-
-def _trusted(factors: Sequence[_Factor], used: BoolArray) -> tuple[_Factor, ...]:
-    return tuple(x for x, ok in zip(factors, used, strict=True) if ok)
 
 
 # Surveys of more keyframes save the time of a round that they do not need.
@@ -184,6 +177,9 @@ def _needless(given: Given, state: State, next_part: float) -> bool:
 
 # The model of the drift is a guess: shifts are expected to be so much wider than it says.
 _CAUTION = 1.5
+# What is expected of any shift beneath what the graph can know, 1-sigma an axis: beams, rocking, the floor that
+# places echoes.
+_LEAST_SHIFT_M = 0.5
 
 
 def _within_reach(
@@ -198,7 +194,7 @@ def _within_reach(
     """
     pairs = np.array([ends_of(given.keyframes, w) for w in windows], np.int64).reshape(-1, 2)
     relative = relative_covariance(state.solution, pairs)
-    expected = _CAUTION**2 * relative + LEAST_SHIFT_M**2 * np.eye(2)
+    expected = _CAUTION**2 * relative + _LEAST_SHIFT_M**2 * np.eye(2)
     unknown = ~np.isfinite(expected).all(axis=(1, 2))
     expected[unknown] = given.config.widest_search_m**2 * np.eye(2)
     joined = np.isfinite(given.keyframes.way_m) & ~(given.keyframes.jump_m > 0)
@@ -206,7 +202,7 @@ def _within_reach(
     separate = dive[pairs[:, 0]] != dive[pairs[:, 1]]
     narrow = 2.0 * np.sqrt(np.linalg.eigvalsh(expected)[:, -1]) <= given.config.widest_search_m
     reached = narrow | separate | unknown
-    return _trusted(windows, reached), {
+    return trusted(windows, reached), {
         _place(w): covariance for w, covariance in zip(windows, expected, strict=True)
     }
 
