@@ -49,8 +49,7 @@ def map_flags(strips: Sequence[ElevationStrip], grid: Grid) -> npt.NDArray[np.ui
         part = hull([box for _, _, box in blocks]).common(window) if blocks else None
         if part is None:
             continue
-        own = no_votes(part)
-        vote(one, rows_of(strip), blocks, grid.cell_m, part, own)
+        own = vote(one, rows_of(strip), blocks, grid.cell_m, part)
         inner = part.within(window)
         votes[inner] = added(votes[inner], own)
         folded[inner] |= mostly(own, CellFlag.AMBIGUOUS)
@@ -82,9 +81,9 @@ def vote(
     blocks: Sequence[tuple[int, int, Window]],
     cell_m: float,
     window: Window,
-    votes: npt.NDArray[np.uint16],
-) -> None:
-    """Count a strip's flags in the cells of a window; its samples are filled in as its heights are."""
+) -> npt.NDArray[np.uint16]:
+    """Return a strip's flags counted in the cells of a window; its samples are filled in as its heights are."""
+    votes = no_votes(window)
     spacing = spacing_of(strip.easting_m, strip.northing_m, strip.across_m, cell_m)
     row0, col0 = strip.anchor(cell_m)
     for first, last in runs_on(blocks, window, len(strip.easting_m)):
@@ -96,6 +95,7 @@ def vote(
             strip.across_m / cell_m, _parts(spacing), spacing.gap_m / cell_m,
             window.row - row0, window.col - col0, _BITS, votes,
         )  # fmt: skip
+    return votes
 
 
 def _parts(spacing: Spacing) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapping.flag_layer import FlagRows, mostly, mostly_clear, no_votes, vote
+from mapping.flag_layer import FlagRows, mostly, mostly_clear, vote
 from mapping.gridding import Window
 from mapping.passes import add_weighted
 from mapping.placed import PassRaster, PlacedStrip
@@ -41,8 +41,7 @@ def with_ambiguity(
     """
     rows, cols = raster.height_m.shape
     part = Window(window.row + raster.row0, window.col + raster.col0, rows, cols)
-    votes = no_votes(part)
-    vote(strip, flags, blocks, cell_m, part, votes)
+    votes = vote(strip, flags, blocks, cell_m, part)
     return replace(raster, ambiguous=mostly(votes, CellFlag.AMBIGUOUS), clear=mostly_clear(votes))
 
 

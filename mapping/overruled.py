@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mapping.flag_layer import mostly_clear, no_votes, rows_of, vote
+from mapping.flag_layer import mostly_clear, rows_of, vote
 from mapping.gridding import Window
 from mapping.objects import MergedObjects
 from mapping.placed import PlacedStrip, boxes, placed
@@ -100,8 +100,7 @@ def _saw(
     row, col = (int(np.floor((c - radius) / cell_m)) for c in (north, east))
     side = int(np.ceil(2 * radius / cell_m)) + 1
     window = Window(row, col, side, side)
-    votes = no_votes(window)
-    vote(one, rows_of(strip), blocks, cell_m, window, votes)
+    votes = vote(one, rows_of(strip), blocks, cell_m, window)
     away = np.hypot(
         (col + np.arange(side) + 0.5) * cell_m - east,
         ((row + np.arange(side) + 0.5) * cell_m - north)[:, None],

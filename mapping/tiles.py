@@ -43,8 +43,7 @@ def fuse_tile(plan: TilePlan, tile: tuple[int, int]) -> Layers | None:
         one, blocks = plan.strips[index], plan.boxes[index]
         height = on_window(one.strip, blocks, plan.cell_m, outer)
         echo = on_window(_echoes(one), blocks, plan.cell_m, core)
-        own = no_votes(outer)
-        vote(one.strip, one.file.flags, blocks, plan.cell_m, outer, own)
+        own = vote(one.strip, one.file.flags, blocks, plan.cell_m, outer)
         folded = mostly(own, CellFlag.AMBIGUOUS)
         votes = added(votes, own[inner])
         seen = mostly_clear(own)
