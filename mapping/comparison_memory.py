@@ -136,11 +136,9 @@ def _states(given: Circumstances) -> list[_Seen]:
     moved = []
     for index, strip in enumerate(given.strips):
         correction = at_lines(strip, index, given.keyframes, given.solution.correction_m)
-        steps = np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))
-        step = max(float(np.median(steps)), 1e-3) if len(steps) else 1.0
         turn = given.solution.pass_errors[index, 2]
         place = np.column_stack([strip.easting_m, strip.northing_m])
-        moved.append((correction, step, turn, place))
+        moved.append((correction, strip.step_m, turn, place))
     out = []
     for window, expected in zip(given.windows, given.expected, strict=True):
         ground = np.empty((2, 2, 2))

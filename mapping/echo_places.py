@@ -30,10 +30,8 @@ def placed_across(strip: ElevationStrip, floor: Grid | None) -> FloatArray:
 
 def _knots(strip: ElevationStrip, cell_m: float) -> IntArray:
     """Return the lines at which the floor is read: one a cell of it, and the last."""
-    steps = np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))
-    usual_m = max(float(np.median(steps)), 1e-3) if len(steps) else cell_m
     last = len(strip.time_s) - 1
-    return np.unique(np.append(np.arange(0, last, max(1, int(cell_m / usual_m))), last))
+    return np.unique(np.append(np.arange(0, last, max(1, int(cell_m / strip.step_m))), last))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -74,12 +74,7 @@ def without(
     """
     if not held:
         return list(windows)
-    step_m = [
-        float(np.median(np.hypot(np.diff(s.easting_m), np.diff(s.northing_m))))
-        if len(s.ping) > 1
-        else 1.0
-        for s in strips
-    ]
+    step_m = [strip.step_m for strip in strips]
     pairs = {(w.first, w.second) for w in (*held, *windows)}
     number = {pair: i for i, pair in enumerate(sorted(pairs))}
 

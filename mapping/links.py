@@ -27,10 +27,9 @@ class PassFacts:
     @classmethod
     def of(cls, strip: ElevationStrip) -> PassFacts:
         """Measure a strip."""
-        steps = np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))
         beneath = -(strip.depth_m + strip.altitude_m)
         unevenness_m = float(np.nanstd(beneath)) if np.isfinite(beneath).any() else np.nan
-        return cls(max(float(np.median(steps)), 1e-3) if len(steps) else 1.0, unevenness_m)
+        return cls(strip.step_m, unevenness_m)
 
 
 def link_of(

@@ -241,9 +241,7 @@ def _edge_means(
 
 def _spacings(strip: ElevationStrip) -> tuple[float, float]:
     """Return the usual distance between lines and between columns."""
-    step = float(np.median(np.hypot(np.diff(strip.easting_m), np.diff(strip.northing_m))))
-    spacing = float(np.median(np.diff(strip.across_m)))
-    return max(step, 1e-3), max(spacing, 1e-3)
+    return strip.step_m, max(float(np.median(np.diff(strip.across_m))), 1e-3)
 
 
 def default_cell(strips: Sequence[ElevationStrip]) -> float:

@@ -183,6 +183,12 @@ class ElevationStrip:
         )  # fmt: skip
         _check_lengths(self, per_line, len(self.time_s))
 
+    @property
+    def step_m(self) -> float:
+        """Return the usual way from line to line, a millimetre at least; 1 m of a single line."""
+        steps = np.hypot(np.diff(self.easting_m), np.diff(self.northing_m))
+        return max(float(np.median(steps)), 1e-3) if len(steps) else 1.0
+
     def sonar_positions(self) -> tuple[FloatArray, FloatArray]:
         """Return easting and northing of the sonar itself, each (n,)."""
         if self.lead_m is None:
