@@ -10,8 +10,8 @@ import pytest
 from gtsam.symbol_shorthand import E
 
 import mapping.pose_graph_relative as relative
-from mapping.keyframes import choose_keyframes, tie_fixes
-from mapping.pose_graph import GraphConfig, build
+from mapping.keyframes import KeyframeFix, Keyframes, choose_keyframes, tie_fixes
+from mapping.pose_graph import GraphConfig, Link, build
 from mapping.pose_graph_relative import relative_covariance
 from mapping.pose_graph_solve import solve
 from mapping.sharing import solve_shared
@@ -19,14 +19,19 @@ from perception.records import FloatArray
 from tests.mapping.test_pose_graph import end_fixes, flights, true_links
 
 
+def flown(rng: np.random.Generator) -> tuple[Keyframes, list[KeyframeFix], list[Link]]:
+    """Return a survey's keyframes, the fixes at its ends and its true registrations."""
+    passes = flights(rng)
+    strips = [f.strip for f in passes]
+    keyframes = choose_keyframes(strips, 15.0)
+    fixes = tie_fixes(end_fixes(passes, rng), strips, keyframes, 4.0)
+    return keyframes, fixes, true_links(passes, keyframes, rng)
+
+
 def both_ways(pairs: int = 12) -> tuple[FloatArray, FloatArray]:
     """Return the covariances of some pairs by this module and by GTSAM's joint marginals."""
     rng = np.random.default_rng(3)
-    flown = flights(rng)
-    strips = [f.strip for f in flown]
-    keyframes = choose_keyframes(strips, 15.0)
-    fixes = tie_fixes(end_fixes(flown, rng), strips, keyframes, 4.0)
-    links = true_links(flown, keyframes, rng)
+    keyframes, fixes, links = flown(rng)
     config = GraphConfig()
     solution = solve(keyframes, links, fixes, config, robust=False)
     chosen = rng.integers(0, len(keyframes), (pairs, 2))
@@ -76,11 +81,7 @@ def test_columns_and_draws_hold_the_same_of_a_range_scale_in_common(
 ) -> None:
     """Of a scale that all but makes the claim, draws know nothing to err in: both agree to 1 %."""
     rng = np.random.default_rng(4)
-    flown = flights(rng)
-    strips = [f.strip for f in flown]
-    keyframes = choose_keyframes(strips, 15.0)
-    fixes = tie_fixes(end_fixes(flown, rng), strips, keyframes, 4.0)
-    links = true_links(flown, keyframes, rng)
+    keyframes, fixes, links = flown(rng)
     solution = solve_shared(keyframes, links, fixes, GraphConfig(range_scale=1.0))
     # Far from each other, where the scale drew them apart.
     pairs = rng.integers(0, len(keyframes), (40, 2))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from perception.object_table import ObjectRow, ObjectTable
-from perception.strips import build_strip
+from perception.strips import PassResult, build_strip
 from scenarios.report.contacts import contacts_of, moved, pictured, touching, write_contacts
 from tests.perception.echo_fixtures import Survey, box, make_swath
 
@@ -72,13 +72,17 @@ def test_objects_whose_footprints_or_shadows_touch_are_one_contact() -> None:
     assert touching(ObjectTable.of([])) == []
 
 
-def test_a_contact_is_told_by_its_highest_part_and_names_the_others(tmp_path: Path) -> None:
+def low_beside_high() -> PassResult:
     low, high = box(0.7, 15, 10, 0.8, 0.8), box(1.2, 16, 13.2, 0.8, 0.8)
     swath = make_swath(
         lambda x, y: low(x, y) + high(x, y), Survey(n_pings=90, n_samples=500),
         np.random.default_rng(5),
     )  # fmt: skip
-    result = build_strip(swath)
+    return build_strip(swath)
+
+
+def test_a_contact_is_told_by_its_highest_part_and_names_the_others(tmp_path: Path) -> None:
+    result = low_beside_high()
     wide = replace(result.objects, half_along_m=result.objects.half_along_m + 1.0)
     contacts = contacts_of(replace(result, objects=wide))
     assert len(result.objects) == 2 and len(contacts) == 1
@@ -114,12 +118,7 @@ def test_two_objects_of_one_ping_at_one_range_move_each_to_its_own_side() -> Non
 def test_a_maps_page_tells_the_heights_of_its_own_list_and_whose_looks_they_are(
     tmp_path: Path,
 ) -> None:
-    low, high = box(0.7, 15, 10, 0.8, 0.8), box(1.2, 16, 13.2, 0.8, 0.8)
-    swath = make_swath(
-        lambda x, y: low(x, y) + high(x, y), Survey(n_pings=90, n_samples=500),
-        np.random.default_rng(5),
-    )  # fmt: skip
-    result = build_strip(swath)
+    result = low_beside_high()
     # Wide enough to touch.
     table = replace(result.objects, half_along_m=result.objects.half_along_m + 1.0)
     (contact,) = contacts_of(replace(result, objects=table))
